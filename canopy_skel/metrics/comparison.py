@@ -7,7 +7,7 @@ import numpy as np
 from canopy_skel.document import SkeletonDocument
 from canopy_skel.errors import DocumentError
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.metrics.matching import any_within, beside, nearest, parallel, share
+from canopy_skel.metrics.matching import Feet, any_within, beside, feet_on, nearest, parallel, share
 from canopy_skel.metrics.pieces import Pieces, chains_of, simple_edges
 
 CURVE_SPACING_M = 0.001
@@ -61,16 +61,15 @@ class Comparison:
 
     right: (N,) output pieces with truth within the tolerance. predicted: (N,) output pieces no
     view showed. found: (M,) truth pieces with output within it. framed: (M,) truth pieces that
-    recalls count. out_m (N,), true_m (M,): distance to the other's curve, infinite without one.
-    truth_index: (N,) the 1 mm truth piece nearest to an output piece.
+    recalls count. out_feet: of the output pieces on the truth; true_m: (M,) distance of the truth
+    pieces to the output's curve. Both are infinite beyond the largest tolerance.
     """
 
     out: Side
     true: Side
     tolerance_m: float
-    out_m: FloatArray
+    out_feet: Feet
     true_m: FloatArray
-    truth_index: IntArray
     right: BoolArray
     predicted: BoolArray
     found: BoolArray
@@ -87,8 +86,8 @@ class Comparison:
 
     def vertex_counts(self) -> tuple[float | None, float | None, float | None]:
         """Return precision, recall and OSR, counting vertices against vertices."""
-        right = nearest(self.out.positions, self.true.positions)[0] <= self.tolerance_m
-        found = nearest(self.true.positions, self.out.positions)[0] <= self.tolerance_m
+        right = nearest(self.out.positions, self.true.positions, self.tolerance_m)[0] < np.inf
+        found = nearest(self.true.positions, self.out.positions, self.tolerance_m)[0] < np.inf
         one = np.ones(len(right))
         return (
             share(right, one),
@@ -135,7 +134,9 @@ class Comparison:
             recall = share(self.true_m <= tolerance_m, self.true.pieces.length_m, among=self.framed)
             if recall is None:
                 return None
-            precision = share(self.out_m <= tolerance_m, self.out.pieces.length_m) or 0.0
+            precision = (
+                share(self.out_feet.distance_m <= tolerance_m, self.out.pieces.length_m) or 0.0
+            )
             total = precision + recall
             scores.append(2 * precision * recall / total if total > 0 else 0.0)
         return float(np.mean(scores))
@@ -143,7 +144,9 @@ class Comparison:
     def radius_errors(self) -> tuple[float | None, float | None]:
         """Return median and mean of |r - r_true| / r_true over right observed pieces."""
         chosen = self.right & ~self.predicted
-        truth = self.true.curve.blend(self.true.document.radius)[self.truth_index[chosen]]
+        if not chosen.any():
+            return None, None
+        truth = self.out_feet.blend(self.true.document.radius)[chosen]
         error = np.abs(self.out.pieces.blend(self.out.document.radius)[chosen] - truth)
         relative = error[truth > 0] / truth[truth > 0]
         if len(relative) == 0:
@@ -156,17 +159,17 @@ def compare(
 ) -> Comparison:
     """Cut both documents into pieces and measure how far each lies from the other's curve."""
     out, true = side_of(document, spacing_m), side_of(truth, spacing_m)
-    out_m, truth_index = nearest(out.pieces.points, true.curve.points)
-    true_m = nearest(true.pieces.points, out.curve.points)[0]
+    reach_m = max(tolerance_m, float(AUC_TOLERANCES_M[-1])) + CURVE_SPACING_M
+    out_feet = feet_on(out.pieces.points, true.curve, true.positions, reach_m)
+    true_m = feet_on(true.pieces.points, out.curve, out.positions, reach_m).distance_m
     framed = true.flags("framed")
     return Comparison(
         out=out,
         true=true,
         tolerance_m=tolerance_m,
-        out_m=out_m,
+        out_feet=out_feet,
         true_m=true_m,
-        truth_index=truth_index,
-        right=out_m <= tolerance_m,
+        right=out_feet.distance_m <= tolerance_m,
         predicted=out.pieces.flag(document.occluded),
         found=true_m <= tolerance_m,
         framed=np.ones(len(true_m), np.bool_) if framed is None else true.pieces.flag(framed),

@@ -8,9 +8,19 @@ from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spannin
 from scipy.spatial import cKDTree
 
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.metrics.pieces import simple_edges, subdivide
+from canopy_skel.metrics.matching import nearest
+from canopy_skel.metrics.pieces import subdivide
 
 _ZERO_M = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class SeenTree:
+    """The truth: positions (V, 3) metres, simple acyclic edges (E, 2), and which are seen (V,)."""
+
+    positions: FloatArray
+    edges: IntArray
+    seen: BoolArray
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -21,43 +31,39 @@ class Gap:
     length_m: float
 
 
+def _components(vertex_count: int, edges: IntArray) -> IntArray:
+    ones = np.ones(len(edges), dtype=np.int8)
+    shape = (vertex_count, vertex_count)
+    adjacency = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=shape)
+    return connected_components(adjacency, directed=False)[1].astype(np.int64)
+
+
 def length_graph(positions: FloatArray, edges: IntArray) -> csr_array:
-    """Return the (V, V) sparse matrix of edge lengths in metres, upper triangle only."""
-    edges = simple_edges(edges)
+    """Return the symmetric (V, V) sparse matrix of the lengths in metres of simple edges."""
     length_m = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
     shape = (len(positions), len(positions))
     weights = np.maximum(length_m, _ZERO_M)  # a stored zero would read as no edge
-    return coo_array((weights, (edges[:, 0], edges[:, 1])), shape=shape).tocsr()
+    both_ways = (np.append(edges[:, 0], edges[:, 1]), np.append(edges[:, 1], edges[:, 0]))
+    return coo_array((np.tile(weights, 2), both_ways), shape=shape).tocsr()
 
 
-def find_gaps(positions: FloatArray, edges: IntArray, seen: BoolArray) -> list[Gap]:
+def find_gaps(truth: SeenTree) -> list[Gap]:
     """Find the gaps between the seen parts of a tree.
 
     A maximal connected set of unseen vertices is one hole; the seen vertices next to it are its
     lips. A hole with n lips makes n - 1 gaps: the pairs of the minimum spanning tree of its lips
     over the path length through the hole.
-
-    Args:
-        positions: (V, 3) metres.
-        edges: (E, 2), acyclic.
-        seen: (V,).
     """
-    unseen_edges = edges[~seen[edges].any(axis=1)]
-    ones = np.ones(len(unseen_edges), dtype=np.int8)
-    shape = (len(positions), len(positions))
-    hole_of = connected_components(
-        coo_array((ones, (unseen_edges[:, 0], unseen_edges[:, 1])), shape=shape), directed=False
-    )[1]
-    rim = edges[seen[edges].sum(axis=1) == 1]
-    lip = np.where(seen[rim[:, 0]], rim[:, 0], rim[:, 1])
-    hole_of_lip = hole_of[np.where(seen[rim[:, 0]], rim[:, 1], rim[:, 0])]
+    edges, seen = truth.edges, truth.seen
+    hole_of = _components(len(seen), edges[~seen[edges].any(axis=1)])
+    open_edges = edges[~seen[edges].all(axis=1)]
+    hole = hole_of[np.where(seen[open_edges[:, 0]], open_edges[:, 1], open_edges[:, 0])]
+    order = np.argsort(hole, kind="stable")
     gaps: list[Gap] = []
-    for hole in np.unique(hole_of_lip):
-        lips = np.unique(lip[hole_of_lip == hole])
+    for around in np.split(open_edges[order], np.flatnonzero(np.diff(hole[order])) + 1):
+        lips = np.unique(around[seen[around]])
         if len(lips) > 1:
-            inside = ~seen & (hole_of == hole)
-            around = edges[inside[edges].any(axis=1)]
-            gaps += _spanning_gaps(positions, around, lips)
+            gaps += _spanning_gaps(truth.positions, around, lips)
     return gaps
 
 
@@ -65,7 +71,7 @@ def _spanning_gaps(positions: FloatArray, edges: IntArray, lips: IntArray) -> li
     members, local = np.unique(edges, return_inverse=True)
     graph = length_graph(positions[members], local.reshape(-1, 2))
     at = np.searchsorted(members, lips)
-    between_m = dijkstra(graph, directed=False, indices=at)[:, at]
+    between_m = dijkstra(graph, indices=at)[:, at]
     tree = minimum_spanning_tree(np.triu(np.maximum(between_m, _ZERO_M), 1)).tocoo()
     return [
         Gap(lips=(int(lips[i]), int(lips[j])), length_m=float(length_m))
@@ -75,7 +81,7 @@ def _spanning_gaps(positions: FloatArray, edges: IntArray, lips: IntArray) -> li
 
 def joined_gaps(
     gaps: list[Gap],
-    truth_positions: FloatArray,
+    truth: SeenTree,
     positions: FloatArray,
     edges: IntArray,
     *,
@@ -84,35 +90,42 @@ def joined_gaps(
 ) -> list[bool]:
     """Say of each gap whether the output connects its lips.
 
-    It does when a path of at most 1.5 x the gap's length + 60 mm runs in the output from a point
-    within `tolerance_m` of one lip to a point within `tolerance_m` of the other. Output edges are
-    subdivided to `spacing_m` first, so that only the curve counts and not where its vertices lie.
-    A point near both lips counts for the nearer: else two stumps that face each other would do.
+    It does when a path of at most 1.5 x the gap's length + 60 mm runs in the output from one lip
+    to the other. An output point stands at a lip when it is within `tolerance_m` of it and nearer
+    to the seen part the lip belongs to than to any other: a branch that only passes close to both
+    lips joins nothing. Edges of both are cut to `spacing_m` first, so that only curves count and
+    not where their vertices lie.
     """
     if not gaps or len(positions) == 0:
         return [False] * len(gaps)
-    positions, edges = subdivide(positions, edges, spacing_m)
-    graph = length_graph(positions, edges)
-    tree = cKDTree(positions)
+    points, pieces = subdivide(positions, edges, spacing_m)
+    graph, tree = length_graph(points, pieces), cKDTree(points)
+    part_at_lip, part_of_point = _parts(truth, points, tolerance_m, spacing_m)
+
+    def points_at(lip: int) -> IntArray:
+        near = np.asarray(tree.query_ball_point(truth.positions[lip], tolerance_m), dtype=np.int64)
+        return near[part_of_point[near] == part_at_lip[lip]]
+
     joined = []
     for gap in gaps:
-        a, b = truth_positions[list(gap.lips)]
-        near_a, near_b = _near(tree, positions, a, b, tolerance_m)
-        limit_m = 1.5 * gap.length_m + 0.06
-        if len(near_a) and len(near_b):
-            path_m = dijkstra(graph, directed=False, indices=near_a, min_only=True, limit=limit_m)
-            joined.append(bool((path_m[near_b] <= limit_m).any()))
-        else:
-            joined.append(False)
+        start, goal = points_at(gap.lips[0]), points_at(gap.lips[1])
+        reached = False
+        if len(start) and len(goal):
+            limit_m = 1.5 * gap.length_m + 0.06
+            path_m = dijkstra(graph, indices=start, min_only=True, limit=limit_m)
+            reached = bool((path_m[goal] <= limit_m).any())
+        joined.append(reached)
     return joined
 
 
-def _near(
-    tree: cKDTree, positions: FloatArray, a: FloatArray, b: FloatArray, tolerance_m: float
+def _parts(
+    truth: SeenTree, points: FloatArray, tolerance_m: float, spacing_m: float
 ) -> tuple[IntArray, IntArray]:
-    near = np.unique(np.concatenate(tree.query_ball_point([a, b], tolerance_m))).astype(np.int64)
-    to_a_m = np.linalg.norm(positions[near] - a, axis=1)
-    to_b_m = np.linalg.norm(positions[near] - b, axis=1)
-    by_a = (to_a_m <= tolerance_m) & (to_a_m < to_b_m)
-    by_b = (to_b_m <= tolerance_m) & (to_b_m < to_a_m)
-    return near[by_a], near[by_b]
+    """Number the seen parts: that of each vertex (V,), and the nearest of each point (P,) or -1."""
+    seen_edges = truth.edges[truth.seen[truth.edges].all(axis=1)]
+    fine, fine_edges = subdivide(truth.positions, seen_edges, spacing_m)
+    part = _components(len(fine), fine_edges)
+    seen = np.flatnonzero(np.append(truth.seen, np.ones(len(fine) - len(truth.seen), np.bool_)))
+    distance_m, index = nearest(points, fine[seen], tolerance_m)
+    nearest_part = np.where(np.isfinite(distance_m), part[seen[index]], -1)
+    return part[: len(truth.seen)], nearest_part

@@ -6,7 +6,7 @@ from canopy_skel.document import SkeletonDocument
 from canopy_skel.errors import UsageError
 from canopy_skel.metrics.calibration import brier_score, expected_calibration_error
 from canopy_skel.metrics.comparison import Comparison, compare
-from canopy_skel.metrics.joining import find_gaps, joined_gaps
+from canopy_skel.metrics.joining import SeenTree, find_gaps, joined_gaps
 from canopy_skel.metrics.matching import share
 from canopy_skel.metrics.topology import components_and_acyclic, parent_correct
 
@@ -178,14 +178,11 @@ def _gaps(both: Comparison, spacing_m: float) -> tuple[int | None, float | None]
     masked = true.flags("segmented")
     if masked is None:
         return None, None
-    gaps = [
-        gap
-        for gap in find_gaps(true.positions, true.edges, masked)
-        if gap.length_m >= SHORTEST_GAP_M
-    ]
+    tree = SeenTree(positions=true.positions, edges=true.edges, seen=masked)
+    gaps = [gap for gap in find_gaps(tree) if gap.length_m >= SHORTEST_GAP_M]
     joined = joined_gaps(
         gaps,
-        true.positions,
+        tree,
         out.positions,
         out.edges,
         tolerance_m=both.tolerance_m,

@@ -12,7 +12,7 @@ from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.metrics.matching import nearest, share
 from canopy_skel.metrics.pieces import subdivide
 
-STRIDE_M = 0.05
+STRIDE = 2.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -89,17 +89,18 @@ def parent_correct(
 ) -> float | None:
     """Return the share, by length, of the output whose way to the root is a way down the truth.
 
-    Each point of the output is compared with the first ancestor at least 50 mm of path below it;
-    both must have truth within `tolerance_m`, and an ancestor without is passed over for the next.
-    The pair is right when the truth of the lower one, moved down by up to `tolerance_m`, leads to
-    the truth of the upper one. None where there is no pair, or a document has no branches.
+    Each point of the output is compared with the first ancestor at least 2.5 x `tolerance_m` of
+    path below it. Both must have truth within `tolerance_m`; an ancestor without is passed over
+    for the next. The pair is right when the truth of the lower one, moved down by up to
+    `tolerance_m`, leads to the truth of the upper one. None where there is no pair, or a document
+    has no branches.
     """
     out, true = forest_of(document, spacing_m), forest_of(truth, spacing_m)
     if not document.branches or not truth.branches:
         return None
-    distance_m, match = nearest(out.positions, true.positions)
-    matched = distance_m <= tolerance_m
-    lower = out.parent[out.ancestors(STRIDE_M * (1 - 1e-9))]
+    distance_m, match = nearest(out.positions, true.positions, tolerance_m)
+    matched = np.isfinite(distance_m)
+    lower = out.parent[out.ancestors(STRIDE * tolerance_m * (1 - 1e-9))]
     carried = np.where(matched, np.arange(len(matched)), -1)
     for vertex in out.order.tolist():
         if carried[vertex] < 0 and out.parent[vertex] >= 0:
