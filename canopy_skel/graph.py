@@ -43,3 +43,32 @@ class SkeletonGraph:
         )
         count, labels = connected_components(adjacency, directed=False)
         return int(count), labels.astype(np.int64)
+
+
+def add_bridges(
+    graph: SkeletonGraph, pairs: IntArray, spacing_m: float, confidence: float
+) -> SkeletonGraph:
+    """Join pairs (M, 2) of vertices by straight occluded pieces no longer than `spacing_m`.
+
+    Radii are interpolated between the two vertices.
+    """
+    start, end = graph.vertices_in_base[pairs[:, 0]], graph.vertices_in_base[pairs[:, 1]]
+    pieces = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / spacing_m), 1).astype(int)
+    positions, radii, edges = [graph.vertices_in_base], [graph.radius_m], [graph.edges]
+    count = len(graph.vertices_in_base)
+    for (a, b), number in zip(pairs, pieces, strict=True):
+        along = np.arange(1, number)[:, None] / number
+        ends, radius = graph.vertices_in_base[[a, b]], graph.radius_m[[a, b]]
+        positions.append(ends[0] + along * (ends[1] - ends[0]))
+        radii.append(radius[0] + along[:, 0] * (radius[1] - radius[0]))
+        chain = np.concatenate([[a], count + np.arange(number - 1), [b]])
+        edges.append(np.stack([chain[:-1], chain[1:]], axis=1))
+        count += number - 1
+    added = count - len(graph.vertices_in_base)
+    return SkeletonGraph(
+        vertices_in_base=np.concatenate(positions),
+        edges=np.concatenate(edges),
+        radius_m=np.concatenate(radii),
+        occluded=np.append(graph.occluded, np.ones(added, dtype=bool)),
+        confidence=np.append(graph.confidence, np.full(added, confidence)),
+    )

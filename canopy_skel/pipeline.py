@@ -1,0 +1,143 @@
+"""Views in, one growing likelihood map, a skeleton out: the whole method in the paper's order."""
+
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from typing import Literal, get_args
+
+from canopy_skel.baselines.ftsem import FtsemConfig, join_break_points
+from canopy_skel.baselines.mst import join_by_spanning_tree
+from canopy_skel.cluster import ClusterConfig, RejectedInstance, cluster_branches
+from canopy_skel.errors import UsageError
+from canopy_skel.frame import View
+from canopy_skel.graph import SkeletonGraph
+from canopy_skel.initial import InitialConfig, initial_skeleton
+from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
+from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
+from canopy_skel.segment import Segmenter
+from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
+
+MethodName = Literal["paper", "mst", "ftsem"]
+METHODS: tuple[MethodName, ...] = get_args(MethodName)
+Stage = Callable[[str], AbstractContextManager[None]]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MethodConfig:
+    """A method by name and the settings of its stages.
+
+    straighten_steps: how often predicted vertices are moved to the mean of their neighbours.
+    """
+
+    name: MethodName = "paper"
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
+    spline: SplineConfig = field(default_factory=SplineConfig)
+    likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    ftsem: FtsemConfig = field(default_factory=FtsemConfig)
+    straighten_steps: int = 10
+
+    def __post_init__(self) -> None:
+        """Refuse a method that is not known."""
+        if self.name not in METHODS:
+            raise UsageError(f"unknown method {self.name!r}: choose one of {', '.join(METHODS)}")
+
+    def sha256(self) -> str:
+        """Return the hash that names this configuration in documents."""
+        return sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Extraction:
+    """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1."""
+
+    graph: SkeletonGraph
+    voxels: int
+    observed_components: int
+    joins: tuple[Join, ...]
+
+
+class Skeletonizer:
+    """Takes views in any order and gives the skeleton of all views so far."""
+
+    def __init__(
+        self,
+        segmenter: Segmenter,
+        config: MethodConfig,
+        *,
+        stage: Stage = lambda name: nullcontext(),
+        memory_limit_bytes: int = 3 << 30,
+    ) -> None:
+        """`stage(name)` is entered around each stage, for whoever wants to time it."""
+        self._segmenter = segmenter
+        self._config = config
+        self._stage = stage
+        self._map = LikelihoodMap(config.likelihood, memory_limit_bytes)
+        self._splines: dict[int, list[BranchSpline]] = {}
+        self._instances = 0
+        self._rejected: list[RejectedInstance] = []
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """The indices of the views that are in, ascending."""
+        return tuple(sorted(self._splines))
+
+    @property
+    def instances(self) -> int:
+        """How many branch instances the segmenter found in all views."""
+        return self._instances
+
+    @property
+    def rejected(self) -> tuple[RejectedInstance, ...]:
+        """Instances, or parts of them, that gave no cluster."""
+        return tuple(self._rejected)
+
+    def add_view(self, view: View) -> int:
+        """Update the map by a view and return how many pieces of wood it showed.
+
+        A view that is already in changes nothing.
+
+        Raises:
+            ViewError: the view cannot be used; nothing has changed.
+            UsageError: the map would not fit into memory; nothing has changed.
+        """
+        if view.index in self._splines:
+            return len(self._splines[view.index])
+        with self._stage("segment"):
+            masks = self._segmenter.segment(view)
+        with self._stage("cluster"):
+            clusters, rejected = cluster_branches(view, masks, self._config.cluster)
+        with self._stage("spline"):
+            splines = [fit_spline(cluster, self._config.spline) for cluster in clusters]
+        with self._stage("likelihood"):
+            self._map.add(segments_of(splines))
+        self._splines[view.index] = splines
+        self._instances += len(masks)
+        self._rejected.extend(rejected)
+        return len(splines)
+
+    def skeleton(self) -> Extraction:
+        """Return the skeleton of all views so far; it does not depend on their order."""
+        splines = [spline for index in self.views for spline in self._splines[index]]
+        with self._stage("initial"):
+            grid = self._map.grid()
+            index = VoxelIndex(grid.voxels)
+            initial = initial_skeleton(segments_of(splines), grid, index, self._config.initial)
+        joins: list[Join] = []
+        with self._stage("join"):
+            if self._config.name == "mst":
+                graph = join_by_spanning_tree(initial, grid.voxel_size_m)
+            elif self._config.name == "ftsem":
+                graph = join_break_points(initial, grid.voxel_size_m, self._config.ftsem)
+            else:
+                joins = search_paths(initial, grid, index)
+                graph = add_paths(initial, joins, grid, index)
+                graph = straighten_predicted(graph, self._config.straighten_steps)
+        return Extraction(
+            graph=graph,
+            voxels=len(grid.voxels),
+            observed_components=initial.components()[0],
+            joins=tuple(joins),
+        )

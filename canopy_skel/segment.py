@@ -1,0 +1,35 @@
+"""Branch instances in a picture: the seam between any segmenter and the method (paper III-A)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from canopy_skel.frame import View
+from canopy_skel.geometry import BoolArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class BranchMask:
+    """One branch instance: a slender, piecewise straight region of the colour image.
+
+    instance: its number in the view (1, 2, …). mask: (h, w) bool, the region's bounding box, whose
+    upper left pixel is (left_px, top_px). confidence: the segmenter's score in (0, 1].
+    """
+
+    instance: int
+    left_px: int
+    top_px: int
+    mask: BoolArray
+    confidence: float
+
+
+class Segmenter(Protocol):
+    """Finds the branches in a view."""
+
+    def segment(self, view: View) -> Sequence[BranchMask]:
+        """Return the branch instances of a view.
+
+        Raises:
+            ViewError: the view lacks what this segmenter needs.
+        """
+        ...
