@@ -1,6 +1,21 @@
 """Recordings (MCAP): read, write, recover and cut; nothing else in the method touches files."""
 
+from canopy_skel.recording.encode import EncodedPicture, encode_view
 from canopy_skel.recording.options import ROS2_TOPICS, TopicOptions
 from canopy_skel.recording.reader import Recording, TopicSummary, read_recording
+from canopy_skel.recording.recover import RecoverReport, cut_recording, recover
+from canopy_skel.recording.writer import RecordingWriter
 
-__all__ = ["ROS2_TOPICS", "Recording", "TopicOptions", "TopicSummary", "read_recording"]
+__all__ = [
+    "ROS2_TOPICS",
+    "EncodedPicture",
+    "Recording",
+    "RecordingWriter",
+    "RecoverReport",
+    "TopicOptions",
+    "TopicSummary",
+    "cut_recording",
+    "encode_view",
+    "read_recording",
+    "recover",
+]

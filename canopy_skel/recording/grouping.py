@@ -18,11 +18,15 @@ RefsByRole = Mapping[str, list[MessageRef]]
 
 @dataclass(kw_only=True, slots=True)
 class Group:
-    """The messages of one view by role; `flaw` says why the view cannot be used, if so."""
+    """The messages of one view by role.
+
+    flaw: why the view cannot be used, if so. partial: because some of its messages were lost.
+    """
 
     index: int
     refs: dict[str, MessageRef] = field(default_factory=dict)
     flaw: str | None = None
+    partial: bool = False
 
 
 def refs_by_role(file: McapFile, options: TopicOptions) -> dict[str, list[MessageRef]]:
@@ -101,6 +105,7 @@ def mark_cut_off(groups: list[Group], suspects: list[Group], options: TopicOptio
     for group in suspects:
         lacking = [role for role in EXPOSURE_ROLES if role in usual and role not in group.refs]
         if lacking and group.flaw is None:
+            group.partial = True
             topics = ", ".join(getattr(options, role) for role in lacking)
             group.flaw = (
                 f"view {group.index}: lost in part, without {topics} (the recording is cut off or"

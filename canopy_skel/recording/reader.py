@@ -69,6 +69,11 @@ class Recording:
         return len(self.groups)
 
     @property
+    def incomplete_views(self) -> tuple[int, ...]:
+        """Indices of views of which the file has lost a part."""
+        return tuple(group.index for group in self.groups if group.partial)
+
+    @property
     def ground_truth(self) -> bytes | None:
         """The attached true skeleton document (simulated recordings), None if there is none."""
         return self.attachment(GROUND_TRUTH)
