@@ -43,12 +43,11 @@ class Side:
 
 def side_of(document: SkeletonDocument, spacing_m: float) -> Side:
     """Cut a document into pieces of at most `spacing_m`, and of 1 mm."""
-    positions = np.asarray(document.position, dtype=np.float64).reshape(-1, 3)
     edges = simple_edges(document.edges)
-    chains = chains_of(positions, edges)
+    chains = chains_of(document.position, edges)
     return Side(
         document=document,
-        positions=positions,
+        positions=document.position,
         edges=edges,
         pieces=chains.pieces(spacing_m),
         curve=chains.pieces(CURVE_SPACING_M),
@@ -115,12 +114,18 @@ class Comparison:
         predicted[asked] = ~any_within(out.points[asked], seen, self.tolerance_m, accept)
         return share(right, out.length_m), share(predicted, out.length_m)
 
-    def recall_of(self, vertices: BoolArray | None) -> float | None:
-        """Return the share found of the framed truth with this flag (V,), None without flags."""
-        if vertices is None:
-            return None
-        pieces = self.true.pieces
-        return share(self.found, pieces.length_m, among=self.framed & pieces.flag(vertices))
+    def recalls(self) -> tuple[float | None, float | None, float | None, float | None]:
+        """Return the recall of masked, unmasked, visible but unmasked, and hidden framed truth."""
+        pieces, segmented = self.true.pieces, self.true.flags("segmented")
+        hidden = pieces.flag(self.true.document.occluded)
+
+        def recall(among: BoolArray) -> float | None:
+            return share(self.found, pieces.length_m, among=self.framed & among)
+
+        if segmented is None:
+            return None, None, None, recall(hidden)
+        masked = pieces.flag(segmented)
+        return recall(masked), recall(~masked), recall(~masked & ~hidden), recall(hidden)
 
     def length_ratio(self) -> float | None:
         """Return the length of the output over the length of the truth it covers."""

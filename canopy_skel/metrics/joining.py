@@ -104,7 +104,8 @@ def joined_gaps(
 
     def points_at(lip: int) -> IntArray:
         near = np.asarray(tree.query_ball_point(truth.positions[lip], tolerance_m), dtype=np.int64)
-        return near[part_of_point[near] == part_at_lip[lip]]
+        at_lip: IntArray = near[part_of_point[near] == part_at_lip[lip]]
+        return at_lip
 
     joined = []
     for gap in gaps:

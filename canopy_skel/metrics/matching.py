@@ -21,10 +21,11 @@ def nearest(points: FloatArray, targets: FloatArray, reach_m: float) -> tuple[Fl
     """
     if len(points) == 0 or len(targets) == 0:
         return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
-    bound_m = np.nextafter(reach_m, np.inf)
-    distance_m, index = cKDTree(targets).query(points, distance_upper_bound=bound_m)
-    distance_m = np.asarray(distance_m, dtype=np.float64)
-    return distance_m, np.where(np.isfinite(distance_m), index, 0).astype(np.int64)
+    found = cKDTree(targets).query(points, distance_upper_bound=reach_m * (1 + 1e-9))
+    distance_m = np.asarray(found[0], dtype=np.float64)
+    distance_m[distance_m > reach_m] = np.inf
+    index = np.where(np.isfinite(distance_m), found[1], 0)
+    return distance_m, index.astype(np.int64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -103,7 +104,7 @@ def any_within(
 
 def parallel(directions: FloatArray, target_directions: FloatArray, degrees: float) -> Accept:
     """Accept pairs whose undirected directions (N, 3), (M, 3) differ by at most `degrees`."""
-    least = np.cos(np.radians(degrees))
+    least = np.cos(np.radians(degrees)) - 1e-9  # diagonals of a voxel grid lie at 45 exactly
 
     def accept(point: IntArray, target: IntArray) -> BoolArray:
         cosine = np.einsum("ij,ij->i", directions[point], target_directions[target])

@@ -82,7 +82,7 @@ class Chains:
 
 def simple_edges(edges: IntArray) -> IntArray:
     """Return each undirected edge (E, 2) once, loops left out."""
-    ordered = np.sort(edges.reshape(-1, 2), axis=1)
+    ordered = np.sort(edges, axis=1)
     return np.unique(ordered[ordered[:, 0] != ordered[:, 1]], axis=0)
 
 

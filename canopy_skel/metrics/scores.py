@@ -129,7 +129,7 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
     precision_strict, osr_strict = both.strict()
     gaps, joined = _gaps(both, spacing_m)
     radius_error_median, radius_error_mean = both.radius_errors()
-    masked, hidden = true.flags("segmented"), true.document.occluded
+    recall_masked, recall_unmasked, recall_visible_unmasked, recall_hidden = both.recalls()
     components, acyclic = components_and_acyclic(len(out.positions), out.document.edges)
     all_m = out.pieces.length_m
     predicted_m = all_m * both.predicted
@@ -146,11 +146,11 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
         precision_directional=both.directional_precision(WITHIN_DEGREES),
         precision_strict=precision_strict,
         osr_strict=osr_strict,
-        recall_masked=both.recall_of(masked),
-        recall_unmasked=both.recall_of(None if masked is None else ~masked),
-        recall_visible_unmasked=both.recall_of(None if masked is None else ~masked & ~hidden),
-        recall_hidden=both.recall_of(hidden),
-        occ_precision=share(both.right, predicted_m),
+        recall_masked=recall_masked,
+        recall_unmasked=recall_unmasked,
+        recall_visible_unmasked=recall_visible_unmasked,
+        recall_hidden=recall_hidden,
+        occ_precision=share(both.right, all_m, among=both.predicted),
         gaps=gaps,
         joined=joined,
         length_ratio=both.length_ratio(),

@@ -62,7 +62,7 @@ def forest_of(document: SkeletonDocument, spacing_m: float) -> Forest:
     """Root a document by its branches (each runs from base to tip), edges cut to `spacing_m`."""
     grown = [step for branch in document.branches for step in pairwise(branch.vertices)]
     table = np.array(grown, dtype=np.int64).reshape(-1, 2)
-    positions, edges = subdivide(document.position.reshape(-1, 3), table, spacing_m)
+    positions, edges = subdivide(document.position, table, spacing_m)
     parent = np.full(len(positions), -1, dtype=np.int64)
     parent[edges[:, 1]] = edges[:, 0]
     children: list[list[int]] = [[] for _ in parent]
