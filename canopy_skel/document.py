@@ -41,6 +41,11 @@ class Method:
     config_sha256: str | None = None
     software: str | None = None
 
+    def fields(self) -> dict[str, object]:
+        """Return what is known, by name."""
+        fields = {name: getattr(self, name) for name in Method.__slots__}
+        return {name: value for name, value in fields.items() if value is not None}
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RejectedView:
@@ -131,7 +136,7 @@ def to_json(document: SkeletonDocument) -> bytes:
         "revision": document.revision,
         "frame": "base",
         "unit": "m",
-        "method": _method_fields(document.method),
+        "method": document.method.fields(),
         "views": {
             "used": document.views_used,
             "rejected": [{"index": v.index, "reason": v.reason} for v in document.views_rejected],
@@ -247,11 +252,6 @@ def _rounded(graph: SkeletonGraph) -> SkeletonGraph:
 def _rounded_array(values: FloatArray, decimals: int) -> FloatArray:
     """Round, and turn the negative zeros that rounding leaves into zeros."""
     return np.round(values, decimals) + 0.0
-
-
-def _method_fields(method: Method) -> dict[str, object]:
-    fields = {name: getattr(method, name) for name in Method.__slots__}
-    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _compact(value: object) -> str:

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.metrics.matching import nearest
-from canopy_skel.metrics.pieces import subdivide
+from canopy_skel.metrics.pieces import components_of, subdivide
 
 _ZERO_M = 1e-12
 
@@ -31,13 +31,6 @@ class Gap:
     length_m: float
 
 
-def _components(vertex_count: int, edges: IntArray) -> IntArray:
-    ones = np.ones(len(edges), dtype=np.int8)
-    shape = (vertex_count, vertex_count)
-    adjacency = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=shape)
-    return connected_components(adjacency, directed=False)[1].astype(np.int64)
-
-
 def length_graph(positions: FloatArray, edges: IntArray) -> csr_array:
     """Return the symmetric (V, V) sparse matrix of the lengths in metres of simple edges."""
     length_m = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
@@ -55,7 +48,7 @@ def find_gaps(truth: SeenTree) -> list[Gap]:
     over the path length through the hole.
     """
     edges, seen = truth.edges, truth.seen
-    hole_of = _components(len(seen), edges[~seen[edges].any(axis=1)])
+    hole_of = components_of(len(seen), edges[~seen[edges].any(axis=1)])
     open_edges = edges[~seen[edges].all(axis=1)]
     hole = hole_of[np.where(seen[open_edges[:, 0]], open_edges[:, 1], open_edges[:, 0])]
     order = np.argsort(hole, kind="stable")
@@ -125,7 +118,7 @@ def _parts(
     """Number the seen parts: that of each vertex (V,), and the nearest of each point (P,) or -1."""
     seen_edges = truth.edges[truth.seen[truth.edges].all(axis=1)]
     fine, fine_edges = subdivide(truth.positions, seen_edges, spacing_m)
-    part = _components(len(fine), fine_edges)
+    part = components_of(len(fine), fine_edges)
     seen = np.flatnonzero(np.append(truth.seen, np.ones(len(fine) - len(truth.seen), np.bool_)))
     distance_m, index = nearest(points, fine[seen], tolerance_m)
     nearest_part = np.where(np.isfinite(distance_m), part[seen[index]], -1)

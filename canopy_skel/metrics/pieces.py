@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 
@@ -54,11 +56,11 @@ class Chains:
         first = np.flatnonzero(np.diff(self.chain, prepend=-1))
         last = np.append(first[1:], len(self.edges))[: len(first)] - 1
         chain_start_m = edge_end_m[first] - edge_m[first]
-        chain_m = edge_end_m[last] - chain_start_m
+        chain_m = np.bincount(self.chain, weights=edge_m)
         count = np.ceil(chain_m / spacing_m - 1e-9).astype(np.int64)
         count = np.where(chain_m > 0, np.maximum(count, 1), 0)
         of = np.repeat(np.arange(len(first)), count)
-        rank = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        rank = np.arange(len(of), dtype=np.float64) - np.repeat(np.cumsum(count) - count, count)
         length_m = (chain_m / np.maximum(count, 1))[of]
 
         def locate(rank: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -84,6 +86,14 @@ def simple_edges(edges: IntArray) -> IntArray:
     """Return each undirected edge (E, 2) once, loops left out."""
     ordered = np.sort(edges, axis=1)
     return np.unique(ordered[ordered[:, 0] != ordered[:, 1]], axis=0)
+
+
+def components_of(vertex_count: int, edges: IntArray) -> IntArray:
+    """Number the connected component of each vertex (V,), from 0."""
+    ones = np.ones(len(edges), dtype=np.int64)
+    shape = (vertex_count, vertex_count)
+    adjacency = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=shape)
+    return connected_components(adjacency, directed=False)[1].astype(np.int64)
 
 
 def chains_of(positions: FloatArray, edges: IntArray) -> Chains:

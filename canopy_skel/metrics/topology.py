@@ -4,13 +4,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.document import SkeletonDocument
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.metrics.matching import nearest, share
-from canopy_skel.metrics.pieces import subdivide
+from canopy_skel.metrics.pieces import components_of, subdivide
 
 STRIDE = 2.5
 
@@ -95,9 +93,9 @@ def parent_correct(
     `tolerance_m`, leads to the truth of the upper one. None where there is no pair, or a document
     has no branches.
     """
-    out, true = forest_of(document, spacing_m), forest_of(truth, spacing_m)
     if not document.branches or not truth.branches:
         return None
+    out, true = forest_of(document, spacing_m), forest_of(truth, spacing_m)
     distance_m, match = nearest(out.positions, true.positions, tolerance_m)
     matched = np.isfinite(distance_m)
     lower = out.parent[out.ancestors(STRIDE * tolerance_m * (1 - 1e-9))]
@@ -121,7 +119,5 @@ def components_and_acyclic(vertex_count: int, edges: IntArray) -> tuple[int, boo
     """
     if vertex_count == 0:
         return 0, True
-    ones = np.ones(len(edges), dtype=np.int8)
-    adjacency = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
-    count = int(connected_components(adjacency, directed=False)[0])
+    count = int(components_of(vertex_count, edges).max()) + 1
     return count, len(edges) == vertex_count - count
