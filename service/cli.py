@@ -1,0 +1,299 @@
+"""`canopy`: the command line. Progress on stderr, results on stdout.
+
+Exit codes: 0 ok, 1 failed, 2 usage, 3 partial (something was left out, and said).
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from enum import IntEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from canopy_skel.document import SkeletonDocument, from_json
+from canopy_skel.errors import CanopyError, DocumentError, UsageError
+from canopy_skel.exports import FORMATS
+from canopy_skel.likelihood import LikelihoodConfig
+from canopy_skel.metrics import score as score_document
+from canopy_skel.pipeline import METHODS, MethodConfig
+from canopy_skel.recording import TopicOptions, read_recording
+from canopy_skel.recording import recover as recover_recording
+from service.doctor import available_memory_bytes, examine
+from service.inspection import describe, inspect_recording
+from service.outputs import require_writable, write_all
+from service.replay import ReplayRequest, ReplayResult
+from service.replay import replay as replay_recording
+
+app = typer.Typer(
+    name="canopy",
+    help="Skeletons of leafy orchard trees from one-sided robot scans.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+Out = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
+
+
+class Exit(IntEnum):
+    """What a caller learns from the exit code."""
+
+    OK = 0
+    FAILED = 1
+    USAGE = 2
+    PARTIAL = 3
+
+
+def main() -> None:
+    """Run the command line; what is the input's fault ends as one line on stderr."""
+    try:
+        app()
+    except CanopyError as error:
+        _complain(error)
+        sys.exit(Exit.USAGE if isinstance(error, UsageError) else Exit.FAILED)
+
+
+@app.command()
+def replay(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
+    output: Out,
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    segmenter: Annotated[str, typer.Option(help="Where branch masks come from.")] = "recorded",
+    voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
+    formats: Annotated[str, typer.Option(help=f"Of {','.join(FORMATS)}.")] = "json,glb",
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(help="ROLE=NAME, e.g. color_image=/rgb or base_frame=base_link; repeatable."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Turn recordings into skeletons, with an overlay picture and a summary for each."""
+    request = ReplayRequest(
+        config=MethodConfig(
+            name=method,  # type: ignore[arg-type]  # MethodConfig names the known ones
+            likelihood=LikelihoodConfig(voxel_size_m=voxel),
+        ),
+        segmenter=segmenter,
+        formats=tuple(formats.split(",")),
+        topics=topic_options(topic or []),
+        memory_limit_bytes=available_memory_bytes() // 2,
+    )
+    _require_distinct_stems(recordings)
+    require_writable(output)
+    results: list[dict[str, object]] = []
+    codes = [_replay_one(path, output, request, results, quiet=as_json) for path in recordings]
+    if as_json:
+        typer.echo(json.dumps(results, indent=2))
+    raise typer.Exit(_overall(codes))
+
+
+def _replay_one(
+    path: Path,
+    output: Path,
+    request: ReplayRequest,
+    results: list[dict[str, object]],
+    *,
+    quiet: bool,
+) -> Exit:
+    try:
+        with _progress() as progress:
+            task = progress.add_task(path.name, total=None)
+            result = replay_recording(path, output, request, _advance(progress, task))
+    except UsageError:
+        raise
+    except CanopyError as error:
+        _complain(error)
+        results.append({"recording": str(path), "error": str(error)})
+        return Exit.FAILED
+    for line in (*result.warnings, *(v.reason for v in result.document.views_rejected)):
+        stderr.print(f"warning: {line}", style="yellow", markup=False)
+    results.append(_replayed(path, result))
+    if not quiet:
+        _say_replayed(path, result)
+    return Exit.OK if result.complete else Exit.PARTIAL
+
+
+def _advance(progress: Progress, task: object) -> Callable[[int, int], None]:
+    def advance(done: int, total: int) -> None:
+        progress.update(task, completed=done, total=total)  # type: ignore[arg-type]
+
+    return advance
+
+
+def _replayed(path: Path, result: ReplayResult) -> dict[str, object]:
+    return {
+        "recording": str(path),
+        "files": [str(file) for file in result.files],
+        "views_used": result.document.views_used,
+        "views_rejected": len(result.document.views_rejected),
+        "warnings": list(result.warnings),
+        "branches": len(result.document.branches),
+        "components": result.document.components,
+    }
+
+
+def _say_replayed(path: Path, result: ReplayResult) -> None:
+    document = result.document
+    length_m = sum(branch.length for branch in document.branches)
+    typer.echo(
+        f"{path.name}: {length_m:.1f} m of skeleton in {len(document.branches)} branches"
+        f" from {document.views_used} views"
+    )
+    for file in result.files:
+        typer.echo(f"  {file}")
+
+
+@app.command()
+def inspect(recording: Path, topic: list[str] | None = None, as_json: AsJson = False) -> None:
+    """Say what a recording holds and which of its views are usable."""
+    facts = inspect_recording(recording, topic_options(topic or []))
+    typer.echo(json.dumps(facts, indent=2) if as_json else describe(facts))
+    if facts["warnings"] or facts["unusable_views"]:
+        raise typer.Exit(Exit.PARTIAL)
+
+
+@app.command()
+def score(
+    skeleton: Annotated[Path, typer.Argument(help="A skeleton document.")],
+    truth: Annotated[Path, typer.Argument(help="The true one, or a recording it is attached to.")],
+    tolerance: Annotated[float, typer.Option(help="Metres within which points match.")] = 0.02,
+    as_json: AsJson = False,
+) -> None:
+    """Score a skeleton against the truth: the paper's figures and the stricter ones."""
+    scores = score_document(
+        _document(skeleton), _truth(truth), tolerance_m=tolerance
+    ).to_dict()
+    if as_json:
+        typer.echo(json.dumps(scores, indent=2))
+        return
+    width = max(map(len, scores))
+    for name, value in scores.items():
+        shown = f"{value:.4f}" if isinstance(value, float) else str(value)
+        typer.echo(f"{name:{width}}  {shown}")
+
+
+@app.command()
+def recover(
+    source: Annotated[Path, typer.Argument(help="A truncated or damaged recording.")],
+    target: Annotated[Path, typer.Argument(help="Where the whole one goes.")],
+    as_json: AsJson = False,
+) -> None:
+    """Rewrite a truncated recording with all that is whole in it."""
+    report = recover_recording(source, target)
+    if as_json:
+        typer.echo(json.dumps({"recording": str(target), "views": report.views}))
+    else:
+        typer.echo(f"{target}: {report.views} views saved")
+
+
+@app.command()
+def export(
+    skeleton: Annotated[Path, typer.Argument(help="A skeleton document (JSON).")],
+    output: Out,
+    formats: Annotated[str, typer.Option(help=f"Of {','.join(FORMATS)}.")] = "glb,swc,ply,csv",
+) -> None:
+    """Write a skeleton document in other formats."""
+    names = formats.split(",")
+    for name in names:
+        if name not in FORMATS:
+            raise UsageError(f"unknown format {name!r}: choose from {', '.join(FORMATS)}")
+    document = _document(skeleton)
+    require_writable(output)
+    stem = skeleton.name.removesuffix(".json").removesuffix(".skeleton")
+    contents = {f"{stem}.skeleton.{name}": FORMATS[name](document) for name in names}
+    for file in write_all(output, contents):
+        typer.echo(file)
+
+
+@app.command()
+def doctor(as_json: AsJson = False) -> None:
+    """Check that this machine has what canopy needs."""
+    findings = examine()
+    if as_json:
+        typer.echo(json.dumps([finding.to_dict() for finding in findings], indent=2))
+    else:
+        for finding in findings:
+            typer.echo(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name}: {finding.detail}")
+    if not all(finding.ok for finding in findings):
+        raise typer.Exit(Exit.FAILED)
+
+
+def topic_options(assignments: list[str]) -> TopicOptions | None:
+    """Return the topic options that ROLE=NAME assignments stand for; None if there are none.
+
+    Raises:
+        UsageError: a role is unknown, or its value does not fit.
+    """
+    if not assignments:
+        return None
+    options = TopicOptions()
+    for assignment in assignments:
+        role, _, value = assignment.partition("=")
+        known = getattr(options, role, None) if role in TopicOptions.__slots__ else None
+        if known is None or not value:
+            roles = ", ".join(TopicOptions.__slots__)
+            raise UsageError(f"--topic {assignment}: give ROLE=NAME with a role of {roles}")
+        options = replace(options, **{role: _like(known, value, assignment)})
+    return options
+
+
+def _like(known: object, value: str, assignment: str) -> object:
+    if isinstance(known, bool):
+        if value not in ("true", "false"):
+            raise UsageError(f"--topic {assignment}: give true or false")
+        return value == "true"
+    if isinstance(known, int):
+        if not value.isdecimal():
+            raise UsageError(f"--topic {assignment}: give whole nanoseconds")
+        return int(value)
+    return value
+
+
+def _document(path: Path) -> SkeletonDocument:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DocumentError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    return from_json(data, str(path))
+
+
+def _truth(path: Path) -> SkeletonDocument:
+    if path.suffix != ".mcap":
+        return _document(path)
+    data = read_recording(path).ground_truth
+    if data is None:
+        raise DocumentError(
+            f"{path}: no ground_truth_skeleton.json is attached; give the true skeleton's JSON"
+        )
+    return from_json(data, f"{path}: ground_truth_skeleton.json")
+
+
+def _require_distinct_stems(recordings: list[Path]) -> None:
+    stems = [path.stem for path in recordings]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise UsageError(
+                f"several recordings are named {stem}: their results would overwrite each other;"
+                " replay them into different folders"
+            )
+
+
+def _overall(codes: list[Exit]) -> Exit:
+    if len(set(codes)) == 1:
+        return codes[0]
+    return Exit.PARTIAL
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), console=stderr, transient=True)
+
+
+def _complain(error: CanopyError) -> None:
+    stderr.print(f"error: {error}", style="red", markup=False)

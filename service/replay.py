@@ -1,0 +1,203 @@
+"""A recording becomes a skeleton and its files: the offline walk of a scan."""
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from canopy_skel.document import Method, RejectedView, SkeletonDocument, build_document
+from canopy_skel.errors import RecordingError, UsageError, ViewError
+from canopy_skel.exports import FORMATS
+from canopy_skel.exports.overlay import draw_overlay
+from canopy_skel.frame import View
+from canopy_skel.pipeline import Extraction, MethodConfig, Skeletonizer
+from canopy_skel.recording import Recording, TopicOptions, read_recording
+from canopy_skel.segment import Segmenter
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+from drivers.stereo import with_depth
+from service.outputs import write_all
+from service.stopwatch import Stopwatch
+
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"recorded": RecordedSegmenter}
+SOFTWARE = f"canopy-skel {version('canopy-skel')}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReplayRequest:
+    """What to replay a recording with. memory_limit_bytes: for the likelihood map."""
+
+    config: MethodConfig
+    segmenter: str
+    formats: tuple[str, ...]
+    topics: TopicOptions | None
+    memory_limit_bytes: int
+
+    def __post_init__(self) -> None:
+        """Refuse names that are not known."""
+        if self.segmenter not in SEGMENTERS:
+            known = ", ".join(SEGMENTERS)
+            raise UsageError(f"unknown segmenter {self.segmenter!r}: choose one of {known}")
+        for name in self.formats:
+            if name not in FORMATS:
+                raise UsageError(f"unknown format {name!r}: choose from {', '.join(FORMATS)}")
+
+
+@dataclass(kw_only=True, slots=True)
+class _Walk:
+    """What has come of the views so far; `picture` is the view that showed most wood."""
+
+    skeletonizer: Skeletonizer
+    rejected: list[RejectedView] = field(default_factory=list)
+    picture: View | None = None
+    most_pieces: int = -1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReplayResult:
+    """Where the files are, and whether all of the recording could be used."""
+
+    files: tuple[Path, ...]
+    document: SkeletonDocument
+    warnings: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether no view was lost."""
+        return not (self.warnings or self.document.views_rejected)
+
+
+def replay(
+    path: Path, out: Path, request: ReplayRequest, progress: Callable[[int, int], None]
+) -> ReplayResult:
+    """Replay one recording and write its skeleton, overlay and summary into `out`.
+
+    `progress(done, total)` is called after each view.
+
+    Raises:
+        RecordingError: the recording cannot be read or has no usable view.
+        UsageError: an argument does not fit, or `out` cannot be written.
+    """
+    stopwatch = Stopwatch()
+    with stopwatch("read"):
+        recording = read_recording(path, request.topics)
+    walk = _walk_views(recording, request, stopwatch, progress)
+    extraction = walk.skeletonizer.skeleton()
+    with stopwatch("document"):
+        document = build_document(
+            extraction.graph,
+            scan_id=recording.scan_id,
+            revision=len(walk.skeletonizer.views),
+            method=Method(
+                name=request.config.name,
+                voxel_size_m=request.config.likelihood.voxel_size_m,
+                config_sha256=request.config.sha256(),
+                software=SOFTWARE,
+            ),
+            views_used=len(walk.skeletonizer.views),
+            views_rejected=walk.rejected,
+        )
+    with stopwatch("export"):
+        contents = _files(path.stem, document, walk, request)
+    summary = _summary(recording, document, walk, extraction, stopwatch)
+    contents[f"{path.stem}.summary.json"] = json.dumps(summary, indent=2).encode() + b"\n"
+    return ReplayResult(
+        files=tuple(write_all(out, contents)), document=document, warnings=recording.warnings
+    )
+
+
+def _walk_views(
+    recording: Recording,
+    request: ReplayRequest,
+    stopwatch: Stopwatch,
+    progress: Callable[[int, int], None],
+) -> _Walk:
+    walk = _Walk(
+        skeletonizer=Skeletonizer(
+            SEGMENTERS[request.segmenter](),
+            request.config,
+            stage=stopwatch,
+            memory_limit_bytes=request.memory_limit_bytes,
+        )
+    )
+    views = recording.views()
+    for done in range(1, recording.view_count + 1):
+        with stopwatch("read"):
+            view = next(views)
+        _add(walk, view, stopwatch)
+        progress(done, recording.view_count)
+    if not walk.skeletonizer.views:
+        reason = walk.rejected[0].reason if walk.rejected else "it holds no view"
+        raise RecordingError(f"{recording.path}: no view is usable; the first: {reason}")
+    return walk
+
+
+def _add(walk: _Walk, view: View | RejectedView, stopwatch: Stopwatch) -> None:
+    if isinstance(view, RejectedView):
+        walk.rejected.append(view)
+        return
+    try:
+        with stopwatch("stereo"):
+            view = with_depth(view)
+        pieces = walk.skeletonizer.add_view(view)
+    except ViewError as error:
+        walk.rejected.append(RejectedView(index=view.index, reason=str(error)))
+        return
+    if pieces > walk.most_pieces:
+        walk.picture, walk.most_pieces = view, pieces
+
+
+def _files(
+    stem: str, document: SkeletonDocument, walk: _Walk, request: ReplayRequest
+) -> dict[str, bytes]:
+    contents = {f"{stem}.skeleton.{name}": FORMATS[name](document) for name in request.formats}
+    if walk.picture is not None:
+        overlay = draw_overlay(walk.picture, document)
+        _, png = cv2.imencode(".png", np.ascontiguousarray(overlay[:, :, ::-1]))
+        contents[f"{stem}.overlay.png"] = png.tobytes()
+    return contents
+
+
+def _summary(
+    recording: Recording,
+    document: SkeletonDocument,
+    walk: _Walk,
+    extraction: Extraction,
+    stopwatch: Stopwatch,
+) -> dict[str, object]:
+    """Return what the replay came across; timings make it the one file that is not repeatable."""
+    skeletonizer = walk.skeletonizer
+    reasons = Counter(instance.reason for instance in skeletonizer.rejected)
+    return {
+        "recording": recording.path.name,
+        "scan_id": recording.scan_id,
+        "warnings": list(recording.warnings),
+        "views": {
+            "used": len(skeletonizer.views),
+            "rejected": [{"index": v.index, "reason": v.reason} for v in walk.rejected],
+        },
+        "instances": {"found": skeletonizer.instances, "rejected": dict(sorted(reasons.items()))},
+        "map": {
+            "voxel_size_m": document.method.voxel_size_m,
+            "occupied_voxels": extraction.voxels,
+        },
+        "joins": {
+            "observed_components": extraction.observed_components,
+            "components": document.components,
+            "paths": [
+                {"cost_nat": round(join.cost_nat, 4), "voxels": len(join.nodes)}
+                for join in extraction.joins
+            ],
+        },
+        "skeleton": {
+            "vertices": len(document.position),
+            "branches": len(document.branches),
+            "length_m": round(sum(branch.length for branch in document.branches), 3),
+            "occluded_vertices": int(document.occluded.sum()),
+        },
+        "seconds": {name: round(value, 3) for name, value in stopwatch.seconds.items()},
+    }
