@@ -1,4 +1,4 @@
-// Print the Khronos validator's report of one .glb file (argument) as JSON.
+// Print the Khronos validator's report of a .glb file as JSON: report.mjs FOLDER-WITH-NODE_MODULES/ FILE
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 
