@@ -169,10 +169,10 @@ def _best_line(along: FloatArray, disparity: FloatArray, config: ClusterConfig) 
 
 def eroded(mask: BoolArray, erosion_px: int, min_share: float) -> BoolArray:
     """Shave `erosion_px` off an (h, w) mask, or keep it where too little would be left."""
+    padded = np.pad(mask.astype(np.uint8), erosion_px)
     kernel = np.ones((3, 3), dtype=np.uint8)
-    inner = cv2.erode(
-        mask.astype(np.uint8), kernel, iterations=erosion_px, borderType=cv2.BORDER_CONSTANT
-    ).astype(bool)
+    inner = cv2.erode(padded, kernel, iterations=erosion_px).astype(bool)
+    inner = inner[erosion_px : -erosion_px or None, erosion_px : -erosion_px or None]
     return inner if inner.sum() >= min_share * mask.sum() else mask
 
 

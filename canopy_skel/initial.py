@@ -72,10 +72,11 @@ def sample_segments(segments: Segments, spacing_m: float) -> Samples:
     first = np.repeat(np.cumsum(pieces + 1) - pieces - 1, pieces + 1)
     along = (np.arange(len(of)) - first) / np.repeat(pieces, pieces + 1)
     points = segments.starts_in_base[of] + along[:, None] * direction[of]
-    order = np.lexsort((segments.radius_m[of], *points.T[::-1]))
+    directions = direction[of] / length[of, None]
+    order = np.lexsort((segments.radius_m[of], *directions.T, *points.T[::-1]))
     return Samples(
         points_in_base=points[order],
-        directions=(direction[of] / length[of, None])[order],
+        directions=directions[order],
         radius_m=segments.radius_m[of][order],
     )
 

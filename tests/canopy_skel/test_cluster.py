@@ -1,0 +1,142 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from canopy_skel.cluster import (
+    ClusterConfig,
+    cluster_branches,
+    connected_parts,
+    eroded,
+    principal_axes,
+)
+from canopy_skel.errors import ViewError
+from canopy_skel.frame import Intrinsics, View
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+
+LENS = Intrinsics(fx_px=400, fy_px=400, cx_px=160, cy_px=100, width_px=320, height_px=200)
+CONFIG = ClusterConfig()
+
+
+def view_with(depth_m, instances, scores=(0.9,), pose=None):
+    return View(
+        index=3,
+        stamp_ns=1,
+        color_rgb=np.zeros((200, 320, 3), np.uint8),
+        intrinsics=LENS,
+        base_from_camera=np.eye(4) if pose is None else pose,
+        depth_m=None if depth_m is None else depth_m.astype(np.float32),
+        instances=instances.astype(np.uint16),
+        scores=scores,
+    )
+
+
+def stick(slope=0.0):
+    """A branch 8 px wide across the picture at 1 m, its depth rising by `slope` m along it."""
+    depth_m, instances = np.full((200, 320), np.nan), np.zeros((200, 320))
+    columns = np.arange(60, 260)
+    instances[96:104, 60:260] = 1
+    depth_m[96:104, 60:260] = 1.0 + slope * (columns - 60) / 200
+    return depth_m, instances
+
+
+def clusters_of(depth_m, instances, **kwargs):
+    view = view_with(depth_m, instances, **kwargs)
+    return cluster_branches(view, RecordedSegmenter().segment(view), CONFIG)
+
+
+def test_a_branch_becomes_its_visible_points():
+    clusters, rejected = clusters_of(*stick())
+    assert rejected == []
+    (cluster,) = clusters
+    assert (cluster.view_index, cluster.instance, cluster.confidence) == (3, 1, 0.9)
+    assert len(cluster.points_in_base) == 6 * 198
+    np.testing.assert_allclose(cluster.points_in_base[:, 2], 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.ptp(cluster.points_in_base[:, 0]), 197 / 400, atol=1e-6)
+    assert cluster.margin_m == pytest.approx(1 / 400)
+
+
+def test_leaves_in_front_and_background_behind_are_cut_from_a_tilted_branch():
+    depth_m, instances = stick(slope=0.3)
+    truth = depth_m.copy()
+    depth_m[96:104, 90:110] = 0.8
+    depth_m[96:104, 180:200] = 2.5
+    clusters, _ = clusters_of(depth_m, instances)
+    points = np.concatenate([cluster.points_in_base for cluster in clusters])
+    u = points[:, 0] / points[:, 2] * 400 + 160
+    expected = truth[100, np.round(u).astype(int)]
+    assert np.abs(points[:, 2] - expected).max() < 0.02
+    assert len(points) == 6 * (198 - 40)
+
+
+def test_a_mask_whose_depth_is_mostly_of_something_else_is_rejected():
+    depth_m, instances = stick()
+    depth_m[96:104, 60:200] = np.random.default_rng(1).uniform(0.5, 4.0, (8, 140))
+    clusters, rejected = clusters_of(depth_m, instances)
+    assert clusters == []
+    assert [(r.view_index, r.instance) for r in rejected] == [(3, 1)]
+    assert "too few points" in rejected[0].reason
+
+
+def test_a_hole_in_depth_splits_a_mask_and_each_part_keeps_the_score():
+    depth_m, instances = stick()
+    depth_m[96:104, 150:185] = np.nan
+    clusters, _ = clusters_of(depth_m, instances)
+    assert [c.confidence for c in clusters] == [0.9, 0.9]
+    assert {c.instance for c in clusters} == {1}
+
+
+def test_a_blob_is_not_a_branch():
+    depth_m, instances = np.full((200, 320), np.nan), np.zeros((200, 320))
+    instances[80:120, 140:180] = 1
+    depth_m[80:120, 140:180] = 1.0
+    clusters, rejected = clusters_of(depth_m, instances)
+    assert clusters == []
+    assert [r.reason for r in rejected] == ["not slender"]
+
+
+def test_points_are_in_base():
+    pose = np.array([[0, 0, 1, 0.5], [-1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, 0, 1]], float)
+    (here,), _ = clusters_of(*stick())
+    (there,), _ = clusters_of(*stick(), pose=pose)
+    np.testing.assert_allclose(
+        there.points_in_base, here.points_in_base @ pose[:3, :3].T + pose[:3, 3], atol=1e-9
+    )
+    np.testing.assert_array_equal(there.camera_in_base, pose[:3, 3])
+
+
+def test_a_view_without_depth_says_what_to_do():
+    with pytest.raises(ViewError, match=r"view 3: no depth; compute it from the stereo pair"):
+        clusters_of(None, stick()[1])
+
+
+def test_a_thin_mask_is_not_eroded_away():
+    thin = np.zeros((5, 40), bool)
+    thin[2] = True
+    np.testing.assert_array_equal(eroded(thin, 1, 0.3), thin)
+    thick = np.ones((12, 40), bool)
+    assert eroded(thick, 1, 0.3).sum() == 10 * 38
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_parts_partition_the_points_and_lie_apart(seed):
+    random = np.random.default_rng(seed)
+    points = random.uniform(0, 0.3, (random.integers(1, 60), 3))
+    parts = connected_parts(points, 0.03)
+    assert sorted(np.concatenate(parts).tolist()) == list(range(len(points)))
+    assert [len(p) for p in parts] == sorted((len(p) for p in parts), reverse=True)
+    for i, one in enumerate(parts):
+        for other in parts[i + 1 :]:
+            gaps = np.linalg.norm(points[one][:, None] - points[other][None], axis=2)
+            assert gaps.min() > 0.03 * 0.999
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_axes_do_not_depend_on_the_order_of_points(seed):
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(50, 3)) * [0.2, 0.05, 0.01]
+    deviation, axes = principal_axes(points)
+    _, again = principal_axes(points[random.permutation(50)])
+    np.testing.assert_allclose(axes, again, atol=1e-9)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
+    assert (np.diff(deviation) <= 0).all()

@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import make_lsq_spline
+
+from canopy_skel.cluster import BranchCluster, principal_axes
+from canopy_skel.spline import SplineConfig, direction_across, fit_spline
+
+LITERAL = SplineConfig(centre_shift=0.0, radius="extent")
+
+
+def cluster_of(points, camera=(0.0, 0.0, -1.0)):
+    return BranchCluster(
+        view_index=0,
+        instance=1,
+        confidence=0.8,
+        margin_m=0.0,
+        camera_in_base=np.array(camera),
+        points_in_base=np.asarray(points, float),
+    )
+
+
+def front_of_cylinder(radius_m, seed=0, count=4000):
+    """What a camera far away along -z sees of a cylinder along x at the origin."""
+    random = np.random.default_rng(seed)
+    across = random.uniform(-radius_m, radius_m, count)
+    depth = -np.sqrt(radius_m**2 - across**2)
+    return np.stack([random.uniform(-0.1, 0.1, count), across, depth], axis=1)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(40, 400))
+def test_control_points_are_those_of_the_library(seed, count):
+    random = np.random.default_rng(seed)
+    along = np.sort(random.uniform(0, 0.2, count))
+    points = np.stack([along, 0.3 * along**2, -0.1 * along], axis=1)
+    points += random.normal(0, 0.002, points.shape)
+    spline = fit_spline(cluster_of(points), LITERAL)
+    _, axes = principal_axes(points)
+    t = (points - points.mean(axis=0)) @ axes[0]
+    order = np.argsort(t)
+    knots = np.linspace(t.min(), t.max(), 4)
+    expected = make_lsq_spline(t[order], points[order], np.r_[knots[0], knots, knots[-1]], k=1)
+    np.testing.assert_allclose(spline.control_points_in_base, expected.c, atol=1e-9)
+
+
+def test_radius_is_the_papers_half_extent_along_pc2():
+    points = front_of_cylinder(0.01)
+    spline = fit_spline(cluster_of(points), LITERAL)
+    assert spline.radius_m == pytest.approx(0.01, rel=0.02)
+
+
+@pytest.mark.parametrize("radius_m", [0.003, 0.012, 0.045])
+def test_the_surface_is_moved_to_the_centre_line(radius_m):
+    points = front_of_cylinder(radius_m)
+    spline = fit_spline(cluster_of(points), SplineConfig())
+    assert spline.radius_m == pytest.approx(radius_m, rel=0.05)
+    off = np.linalg.norm(spline.control_points_in_base[:, 1:], axis=1)
+    assert off.max() < 0.15 * radius_m
+
+
+def test_depth_noise_does_not_enter_the_radius_across():
+    points = front_of_cylinder(0.004)
+    points[:, 2] += np.random.default_rng(1).normal(0, 0.006, len(points))
+    assert fit_spline(cluster_of(points), SplineConfig()).radius_m == pytest.approx(0.004, rel=0.1)
+    assert fit_spline(cluster_of(points), LITERAL).radius_m > 0.015
+
+
+def test_an_empty_span_means_fewer_control_points():
+    along = np.r_[np.linspace(0, 0.001, 50), np.linspace(0.199, 0.2, 50)]
+    points = np.stack([along, 0.01 * along, np.zeros(100)], axis=1)
+    spline = fit_spline(cluster_of(points), LITERAL)
+    assert len(spline.control_points_in_base) == 2
+    np.testing.assert_allclose(spline.control_points_in_base[:, 0], [0.0, 0.2], atol=1e-4)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_rigid_motion_moves_the_spline(seed):
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(200, 3)) * [0.1, 0.006, 0.004]
+    rotation, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    shift = random.uniform(-1, 1, 3)
+    here = fit_spline(cluster_of(points), SplineConfig())
+    camera = rotation @ np.array([0.0, 0.0, -1.0]) + shift
+    there = fit_spline(cluster_of(points @ rotation.T + shift, camera), SplineConfig())
+    moved = here.control_points_in_base @ rotation.T + shift
+    either = [there.control_points_in_base, there.control_points_in_base[::-1]]
+    assert min(np.abs(moved - e).max() for e in either) < 1e-8
+    assert there.radius_m == pytest.approx(here.radius_m, abs=1e-9)
+
+
+def test_a_branch_that_points_at_the_camera_has_a_direction_across():
+    across = direction_across(np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.0]))
+    assert across @ [0, 0, 1] == pytest.approx(0.0)
+    assert np.linalg.norm(across) == pytest.approx(1.0)
