@@ -166,9 +166,7 @@ def score(
     as_json: AsJson = False,
 ) -> None:
     """Score a skeleton against the truth: the paper's figures and the stricter ones."""
-    scores = score_document(
-        _document(skeleton), _truth(truth), tolerance_m=tolerance
-    ).to_dict()
+    scores = score_document(_document(skeleton), _truth(truth), tolerance_m=tolerance).to_dict()
     if as_json:
         typer.echo(json.dumps(scores, indent=2))
         return

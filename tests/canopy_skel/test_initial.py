@@ -83,9 +83,7 @@ def test_smoothing_keeps_the_ends_where_they_are():
 
 
 def test_crossing_branches_are_not_pulled_into_each_other():
-    segments = segments_from(
-        [(-0.1, 0, 0), (0, -0.1, 0.004)], [(0.1, 0, 0), (0, 0.1, 0.004)]
-    )
+    segments = segments_from([(-0.1, 0, 0), (0, -0.1, 0.004)], [(0.1, 0, 0), (0, 0.1, 0.004)])
     smoothed = smooth_across(sample_segments(segments, VOXEL), InitialConfig())
     assert set(np.round(smoothed.points_in_base[:, 2], 6)) == {0.0, 0.004}
 
@@ -117,9 +115,7 @@ def test_the_forest_is_the_euclidean_one_without_long_edges(seed, count):
             if gap <= 0.012:
                 everything.add_edge(a, b, weight=gap)
     expected = nx.minimum_spanning_tree(everything)
-    assert {tuple(sorted(e)) for e in edges.tolist()} == {
-        tuple(sorted(e)) for e in expected.edges
-    }
+    assert {tuple(sorted(e)) for e in edges.tolist()} == {tuple(sorted(e)) for e in expected.edges}
 
 
 def test_one_vertex_per_voxel_inside_it():

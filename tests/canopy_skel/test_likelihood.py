@@ -65,9 +65,7 @@ def test_a_thin_branch_fills_every_voxel_it_passes():
 
 
 @given(
-    st.lists(
-        st.lists(segment.filter(long_enough), min_size=1, max_size=3), min_size=2, max_size=4
-    ),
+    st.lists(st.lists(segment.filter(long_enough), min_size=1, max_size=3), min_size=2, max_size=4),
     st.randoms(),
 )
 def test_the_order_of_views_does_not_matter_to_the_bit(groups, random):
@@ -88,9 +86,7 @@ def test_more_evidence_never_lowers_the_likelihood(rows):
 
 @given(st.lists(segment.filter(long_enough), min_size=1, max_size=4))
 def test_scaling_scene_and_voxel_together_changes_nothing(rows):
-    doubled = [
-        (tuple(2 * np.array(s)), tuple(2 * np.array(e)), 2 * r, c) for s, e, r, c in rows
-    ]
+    doubled = [(tuple(2 * np.array(s)), tuple(2 * np.array(e)), 2 * r, c) for s, e, r, c in rows]
     one, other = grid_of(rows), grid_of(doubled, voxel=2 * VOXEL)
     np.testing.assert_array_equal(one.voxels, other.voxels)
     np.testing.assert_array_equal(one.units, other.units)

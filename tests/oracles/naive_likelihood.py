@@ -32,7 +32,9 @@ def observed(voxel, start, end, radius, confidence, voxel_size_m, k):
     along = float(offset @ axis)
     d_l = max(0.0, -along, along - length)
     d_r = float(np.linalg.norm(offset - along * axis))
-    return max(0.0, confidence - confidence / k * math.sqrt((d_l / length) ** 2 + (d_r / radius) ** 2))
+    return max(
+        0.0, confidence - confidence / k * math.sqrt((d_l / length) ** 2 + (d_r / radius) ** 2)
+    )
 
 
 def meets(voxel, start, end):
