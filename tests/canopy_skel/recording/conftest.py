@@ -80,10 +80,13 @@ def messages_of(view: View) -> dict[str, Message]:
     return {message.topic: message for message in encoded}
 
 
-def write_raw(path: Path, messages: Iterable[Message], chunk_size: int = 1 << 20) -> Path:
-    """Write any messages, each topic with its schema of the table (unknown topics: none)."""
+def write_raw(path: Path, messages: Iterable[Message], **options: object) -> Path:
+    """Write any messages, each topic with its schema of the table (unknown topics: none).
+
+    options: of the stock MCAP writer.
+    """
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=chunk_size)
+        writer = Writer(stream, **options)
         writer.start()
         channels: dict[str, int] = {}
         for message in messages:

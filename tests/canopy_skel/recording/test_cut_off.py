@@ -34,7 +34,7 @@ def whole(kit, tmp_path_factory):
 def foreign(kit, tmp_path_factory):
     """The same views written by a recorder that does not care where chunks end."""
     messages = [m for view in kit.views for m in kit.messages_of(view).values()]
-    path = kit.write_raw(tmp_path_factory.mktemp("foreign") / "a.mcap", messages, 3000)
+    path = kit.write_raw(tmp_path_factory.mktemp("foreign") / "a.mcap", messages, chunk_size=3000)
     return path.read_bytes()
 
 
@@ -153,6 +153,20 @@ def test_recover_tells_readers_which_view_is_not_whole(foreign, tmp_path):
     rejected = list(after.views())[-1]
     assert isinstance(rejected, RejectedView)
     assert "lost in part, without" in rejected.reason
+
+
+def test_a_file_without_chunks_is_read_cut_and_recovered(kit, tmp_path):
+    messages = [m for view in kit.views for m in kit.messages_of(view).values()]
+    path = kit.write_raw(tmp_path / "a.mcap", messages, use_chunking=False)
+    for view, written in zip(read_recording(path).views(), kit.views, strict=True):
+        kit.assert_same_view(view, written)
+
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    report = recover(tmp_path / "cut.mcap", tmp_path / "good.mcap")
+    saved = [v for v in read_recording(tmp_path / "good.mcap").views() if isinstance(v, View)]
+    assert report.views_saved == len(saved) == 2
+    for view, written in zip(saved, kit.views, strict=False):
+        kit.assert_same_view(view, written)
 
 
 def test_recover_never_writes_over_a_file(whole, tmp_path):
