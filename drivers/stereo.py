@@ -21,7 +21,7 @@ class StereoConfig:
     the best match must beat the second. speckle_px, speckle_step_px: patches smaller than this
     whose disparity differs from their surroundings by more are dropped. all_directions: eight paths
     instead of three: about 1.3 s and 0.8 GB instead of 0.3 s per pair of 1280x800, and 4 to 6
-    percent more of the branch pixels right.
+    points more of the branch pixels right.
     """
 
     nearest_m: float = 0.35

@@ -67,7 +67,8 @@ class _Exposure:
     decoders: Mapping[str, Decoder]
 
     def view(self) -> View:
-        side: _Side = "color" if "color_image" in self.parts else "left"
+        grey_only = "color_image" not in self.parts and "left_image" in self.parts
+        side: _Side = "left" if grey_only else "color"
         picture = self._picture(f"{side}_image")
         lens = self._lens(side)
         stamp_ns = picture.stamp_ns or self.parts[f"{side}_image"].log_time_ns

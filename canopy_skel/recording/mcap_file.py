@@ -28,7 +28,7 @@ from canopy_skel.errors import RecordingError
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNKS_IN_MEMORY = 4
-# What the parsers of the mcap package and the decompressors raise on damaged bytes.
+# What the parsers of the mcap package and the decompressors (lz4: RuntimeError) raise on damage.
 _DAMAGE = (
     McapError,
     CRCValidationError,

@@ -99,10 +99,11 @@ class Recording:
         rejected: list[str] = []
         for group in self.groups:
             try:
-                yield self._decode(group, reader, decoders)
+                found: View | RejectedView = self._decode(group, reader, decoders)
             except ViewError as error:
                 rejected.append(str(error))
-                yield RejectedView(index=group.index, reason=str(error))
+                found = RejectedView(index=group.index, reason=str(error))
+            yield found
         if len(rejected) == len(self.groups):
             first = rejected[0] if rejected else "it holds no picture at all"
             raise RecordingError(

@@ -1,0 +1,324 @@
+"""Bad input gets one line that names file, topic, view and mend; it never costs other views."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+
+from canopy_skel.document import RejectedView
+from canopy_skel.errors import RecordingError
+from canopy_skel.frame import View
+from canopy_skel.messages import (
+    StampedTransform,
+    encode_compressed_image,
+    encode_raw_image,
+    encode_scores,
+    encode_transforms,
+)
+from canopy_skel.recording import TopicOptions, read_recording
+
+COLOR, DEPTH, TF = "/camera/color/image", "/camera/depth/image", "/tf"
+INSTANCES, SCORES = "/camera/branches/instances", "/camera/branches/scores"
+BROKEN = 1
+
+
+@pytest.fixture
+def read_broken(kit, depth_only, tmp_path):
+    """Break the messages of view 1 of 4 and return its reason; the others must not care."""
+
+    def read(**changes: bytes | None) -> str:
+        messages = []
+        for view in depth_only:
+            by_topic = kit.messages_of(view)
+            if view.index == BROKEN:
+                for topic, data in changes.items():
+                    if data is None:
+                        del by_topic[topic]
+                    else:
+                        by_topic[topic] = replace(by_topic[topic], data=data)
+            messages.extend(by_topic.values())
+        recording = read_recording(kit.write_raw(tmp_path / "a.mcap", messages))
+        found = list(recording.views())
+        assert recording.view_count == len(depth_only)
+        assert [one.index for one in found] == [view.index for view in depth_only]
+        for one, written in zip(found, depth_only, strict=True):
+            if one.index != BROKEN:
+                kit.assert_same_view(one, written)
+        rejected = found[BROKEN]
+        assert isinstance(rejected, RejectedView)
+        assert "\n" not in rejected.reason
+        assert rejected.reason.startswith("view 1: ")
+        return rejected.reason
+
+    return read
+
+
+def _tf(view: View, quaternion=(0.0, 0.0, 0.0, 1.0), translation=(0.0, 0.0, 0.0)) -> bytes:
+    return encode_transforms(
+        [
+            StampedTransform(
+                stamp_ns=view.stamp_ns,
+                parent="base",
+                child="tool0",
+                translation_m=translation,
+                quaternion_xyzw=quaternion,
+            )
+        ]
+    )
+
+
+def _image(view: View, pixels: np.ndarray, encoding: str, late_ns: int = 0) -> bytes:
+    return encode_raw_image(pixels, encoding, view.stamp_ns + late_ns, "camera_color_optical_frame")
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(RecordingError, match=r"gone\.mcap: no such file; check the path"):
+        read_recording(tmp_path / "gone.mcap")
+
+
+def test_a_folder_is_no_recording(tmp_path):
+    with pytest.raises(RecordingError, match=r"cannot be read \(Is a directory\)"):
+        read_recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "text"), [(b"", "is empty"), (b"#ROSBAG V2.0\n" * 9, "is not an MCAP file")]
+)
+def test_not_mcap(tmp_path, content, text):
+    (tmp_path / "a.bag").write_bytes(content)
+    with pytest.raises(RecordingError, match=rf"a\.bag: {text}; .*mcap convert"):
+        read_recording(tmp_path / "a.bag")
+
+
+def test_without_a_camera_topic_the_topics_are_listed(kit, tmp_path):
+    messages = kit.messages_of(kit.views[0])
+    kept = [messages[TF], messages[COLOR], replace(messages[SCORES], topic="/other")]
+    path = kit.write_raw(tmp_path / "a.mcap", kept)
+    with pytest.raises(RecordingError) as caught:
+        read_recording(path)
+    text = str(caught.value)
+    assert "a.mcap: no usable camera topic: needs /camera/color/image with /camera/depth/i" in text
+    assert "/camera/color/image (foxglove.CompressedImage), /other (json), /tf (fox" in text
+    assert "\n" not in text
+
+
+def test_a_recording_without_messages(kit, tmp_path):
+    with pytest.raises(RecordingError, match=r"no usable camera topic.* no topic at all"):
+        read_recording(kit.write_raw(tmp_path / "a.mcap", []))
+
+
+def test_missing_calibration(kit, depth_only, tmp_path):
+    messages = [
+        message
+        for view in depth_only
+        for message in kit.messages_of(view).values()
+        if "calibration" not in message.topic
+    ]
+    with pytest.raises(RecordingError, match="no camera calibration on /camera/color/calibration"):
+        read_recording(kit.write_raw(tmp_path / "a.mcap", messages))
+
+
+def test_one_calibration_before_the_first_view_is_enough(kit, depth_only, tmp_path):
+    messages = [
+        message
+        for view in depth_only
+        for message in kit.messages_of(view).values()
+        if "calibration" not in message.topic or view.index == 0
+    ]
+    read = list(read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views())
+    for view, written in zip(read, depth_only, strict=True):
+        kit.assert_same_view(view, written)
+
+
+def test_a_calibration_after_a_view_does_not_count(kit, depth_only, tmp_path):
+    messages = [
+        message
+        for view in depth_only
+        for message in kit.messages_of(view).values()
+        if "calibration" not in message.topic or view.index == 1
+    ]
+    first, *others = read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views()
+    assert "view 0: /camera/color/calibration: missing; record it" in first.reason
+    assert [view.index for view in others if isinstance(view, View)] == [1, 2, 3]
+
+
+def test_uncalibrated_camera(read_broken):
+    calibration = CameraCalibration(width=64, height=48, K=[0.0] * 9, R=[0.0] * 9, P=[0.0] * 12)
+    reason = read_broken(**{"/camera/color/calibration": calibration.SerializeToString()})
+    assert "/camera/color/calibration: K has no focal length; calibrate" in reason
+
+
+def test_missing_pose(read_broken):
+    reason = read_broken(**{TF: None})
+    assert "/tf: no pose base -> tool0 at the exposure (the nearest is 1500.0 ms away" in reason
+    assert "record the pose at each exposure" in reason
+
+
+def test_no_pose_at_all(kit, depth_only, tmp_path):
+    messages = [m for v in depth_only for m in kit.messages_of(v).values() if m.topic != TF]
+    recording = read_recording(kit.write_raw(tmp_path / "a.mcap", messages))
+    found = []
+    with pytest.raises(RecordingError) as caught:
+        found.extend(recording.views())
+    assert "a.mcap: none of 4 views is usable; the first: view 0: /tf: no chain" in str(
+        caught.value
+    )
+
+
+def test_every_rejected_view_is_told_before_the_error(kit, depth_only, tmp_path):
+    messages = [m for v in depth_only for m in kit.messages_of(v).values() if m.topic != TF]
+    views = read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views()
+    assert [next(views).index for _ in depth_only] == [0, 1, 2, 3]
+    with pytest.raises(RecordingError):
+        next(views)
+
+
+def test_another_base_frame_is_an_option(kit, depth_only, tmp_path):
+    messages = [m for v in depth_only for m in kit.messages_of(v).values()]
+    path = kit.write_raw(tmp_path / "a.mcap", messages)
+    world = next(read_recording(path, TopicOptions(base_frame="tool0")).views())
+    np.testing.assert_allclose(world.base_from_camera, kit.tool_from_camera, atol=1e-12)
+    lost = read_recording(path, TopicOptions(base_frame="moon"))
+    with pytest.raises(RecordingError, match=r"'moon' to 'camera_color_optical_frame' .*base, cam"):
+        list(lost.views())
+
+
+@pytest.mark.parametrize(
+    ("pose", "text"),
+    [
+        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "base -> tool0: quaternion .* has no direction"),
+        ({"quaternion": (0.0, float("nan"), 0.0, 1.0)}, "quaternion .*nan.* has no direction"),
+        ({"translation": (0.0, float("inf"), 0.0)}, r"translation \[0.0, inf, 0.0\] is not finite"),
+    ],
+)
+def test_degenerate_pose(kit, read_broken, pose, text):
+    assert re.search(text, read_broken(**{TF: _tf(kit.views[BROKEN], **pose)}))
+
+
+def test_depth_of_another_size(kit, read_broken):
+    small = np.full((24, 32), 1000, np.uint16)
+    reason = read_broken(**{DEPTH: _image(kit.views[BROKEN], small, "16UC1")})
+    assert f"{DEPTH}: is 32x24 but the calibration says 64x48; record both" in reason
+
+
+def test_depth_all_zero(kit, read_broken):
+    nothing = np.zeros((48, 64), np.uint16)
+    reason = read_broken(**{DEPTH: _image(kit.views[BROKEN], nothing, "16UC1")})
+    assert f"{DEPTH}: holds no return at all (every pixel is 0); check the depth camera" in reason
+
+
+def test_depth_in_metres_is_understood(kit, depth_only, tmp_path):
+    messages = []
+    for view in depth_only:
+        by_topic = kit.messages_of(view)
+        metres = np.where(np.isnan(view.depth_m), np.float32(0), view.depth_m)
+        by_topic[DEPTH] = replace(by_topic[DEPTH], data=_image(view, metres, "32FC1"))
+        messages.extend(by_topic.values())
+    read = read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views()
+    for view, written in zip(read, depth_only, strict=True):
+        kit.assert_same_view(view, written)
+
+
+def test_depth_that_is_a_colour_picture(kit, read_broken):
+    grey = np.full((48, 64), 7, np.uint8)
+    reason = read_broken(**{DEPTH: _image(kit.views[BROKEN], grey, "mono8")})
+    assert f"{DEPTH}: has samples of uint8; depth is 16UC1 (millimetres) or 32FC1" in reason
+
+
+def test_depth_of_another_moment(kit, read_broken):
+    view = kit.views[BROKEN]
+    data = _image(view, np.full((48, 64), 900, np.uint16), "16UC1", late_ns=21_000_000)
+    reason = read_broken(**{DEPTH: data})
+    assert f"{DEPTH}: was taken +21.0 ms from the colour image (limit 20 ms)" in reason
+
+
+def test_missing_depth(read_broken):
+    assert f"{DEPTH}: missing, and there is no stereo pair" in read_broken(**{DEPTH: None})
+
+
+def test_missing_colour(read_broken):
+    assert f"{COLOR}: missing; record it" in read_broken(**{COLOR: None})
+
+
+def test_damaged_colour_picture(kit, read_broken):
+    stamp_ns = kit.views[BROKEN].stamp_ns
+    data = encode_compressed_image(b"\xff\xd8 torn", "jpeg", stamp_ns, "c")
+    assert f"{COLOR}: the jpeg picture (7 bytes) cannot be decoded" in read_broken(**{COLOR: data})
+
+
+def test_bytes_that_are_no_message(read_broken):
+    assert f"{DEPTH}: is not a foxglove.RawImage" in read_broken(**{DEPTH: b"\x0a\xff\xff\xff"})
+
+
+def test_instances_without_scores(read_broken):
+    assert f"{SCORES}: missing, but {INSTANCES} is there" in read_broken(**{SCORES: None})
+
+
+def test_scores_without_instances(read_broken):
+    assert f"{INSTANCES}: missing, but {SCORES} is there" in read_broken(**{INSTANCES: None})
+
+
+def test_an_instance_without_a_score(read_broken):
+    reason = read_broken(**{SCORES: encode_scores([0.9, 0.8])})
+    assert f"{SCORES}: holds 2 scores but {INSTANCES} has instance 3; give one score per" in reason
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b'{"scores": 3}', "is not a JSON object"),
+        (b'{"points": [1]}', "is not a JSON object"),
+        (b"[1, 2, 3]", "is not a JSON object"),
+        (b"\xff{", "is not a JSON object"),
+        (b'{"scores": [0.5, 0.5, NaN]}', "holds a score outside [0, 1]"),
+        (b'{"scores": [0.5, 0.5, 1.5]}', "holds a score outside [0, 1]"),
+    ],
+)
+def test_scores_that_are_none(read_broken, data, text):
+    assert f"{SCORES}: {text}" in read_broken(**{SCORES: data})
+
+
+def test_two_views_with_one_index(kit, depth_only, tmp_path):
+    twin = replace(kit.make_view(9), index=1, stereo=None)
+    messages = [m for v in (*depth_only, twin) for m in kit.messages_of(v).values()]
+    found = list(read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views())
+
+    assert [one.index for one in found] == [0, 1, 1, 2, 3]
+    kit.assert_same_view(found[1], depth_only[1])
+    assert isinstance(found[2], RejectedView)
+    assert "view 1: a second view with this index; the first is used" in found[2].reason
+
+
+def test_a_pair_of_another_camera_needs_a_depth_image(kit, tmp_path):
+    messages = []
+    for view in kit.views:
+        by_topic = kit.messages_of(view)
+        left = by_topic["/camera/left/image"]
+        data = encode_raw_image(view.stereo.left_mono, "mono8", view.stamp_ns, "other_camera")
+        by_topic["/camera/left/image"] = replace(left, data=data)
+        if view.index == 2:
+            del by_topic[DEPTH]
+        messages.extend(by_topic.values())
+    found = list(read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views())
+
+    assert [getattr(one, "stereo", None) for one in found] == [None] * 4
+    assert isinstance(found[2], RejectedView)
+    assert f"is of another camera than {COLOR} and there is no depth image" in found[2].reason
+
+
+def test_only_a_pair_makes_the_left_camera_the_colour_camera(kit, tmp_path):
+    messages = [
+        message
+        for view in kit.views
+        for message in kit.messages_of(view).values()
+        if "color" not in message.topic and "depth" not in message.topic
+    ]
+    for view, written in zip(
+        read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views(),
+        kit.views,
+        strict=True,
+    ):
+        grey = np.repeat(written.stereo.left_mono[..., None], 3, axis=2)
+        kit.assert_same_view(view, replace(written, color_rgb=grey, depth_m=None))
