@@ -30,7 +30,7 @@ class ClusterConfig:
     """
 
     erosion_px: int = 1
-    min_eroded_share: float = 0.3
+    min_eroded_share: float = 0.5
     nearest_m: float = 0.3
     farthest_m: float = 5.0
     draws: int = 60

@@ -6,10 +6,10 @@ Exit codes: 0 ok, 1 failed, 2 usage, 3 partial (something was left out, and said
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -21,7 +21,7 @@ from canopy_skel.exports import FORMATS
 from canopy_skel.likelihood import LikelihoodConfig
 from canopy_skel.metrics import score as score_document
 from canopy_skel.pipeline import METHODS, MethodConfig
-from canopy_skel.recording import TopicOptions, read_recording
+from canopy_skel.recording import RecoverReport, TopicOptions, read_recording
 from canopy_skel.recording import recover as recover_recording
 from service.doctor import available_memory_bytes, examine
 from service.inspection import describe, inspect_recording
@@ -185,9 +185,11 @@ def recover(
     """Rewrite a truncated recording with all that is whole in it."""
     report = recover_recording(source, target)
     if as_json:
-        typer.echo(json.dumps({"recording": str(target), "views": report.views}))
+        typer.echo(json.dumps(jsonable(report), indent=2))
     else:
-        typer.echo(f"{target}: {report.views} views saved")
+        typer.echo(f"{target}: {report.views_saved} whole views saved")
+    for line in report.damage:
+        stderr.print(f"warning: {line}", style="yellow", markup=False)
 
 
 @app.command()
@@ -222,23 +224,26 @@ def doctor(as_json: AsJson = False) -> None:
         raise typer.Exit(Exit.FAILED)
 
 
+def jsonable(report: RecoverReport) -> dict[str, object]:
+    """Return the fields of a report, ready for JSON."""
+    fields = asdict(report)
+    return {**fields, "source": str(report.source), "target": str(report.target)}
+
+
 def topic_options(assignments: list[str]) -> TopicOptions | None:
     """Return the topic options that ROLE=NAME assignments stand for; None if there are none.
 
     Raises:
         UsageError: a role is unknown, or its value does not fit.
     """
-    if not assignments:
-        return None
-    options = TopicOptions()
+    changes: dict[str, Any] = {}
     for assignment in assignments:
         role, _, value = assignment.partition("=")
-        known = getattr(options, role, None) if role in TopicOptions.__slots__ else None
-        if known is None or not value:
+        if role not in TopicOptions.__slots__ or not value:
             roles = ", ".join(TopicOptions.__slots__)
             raise UsageError(f"--topic {assignment}: give ROLE=NAME with a role of {roles}")
-        options = replace(options, **{role: _like(known, value, assignment)})
-    return options
+        changes[role] = _like(getattr(TopicOptions(), role), value, assignment)
+    return replace(TopicOptions(), **changes) if changes else None
 
 
 def _like(known: object, value: str, assignment: str) -> object:
@@ -290,7 +295,8 @@ def _overall(codes: list[Exit]) -> Exit:
 
 def _progress() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), console=stderr, transient=True)
+    quiet = not stderr.is_terminal
+    return Progress(*columns, TimeElapsedColumn(), console=stderr, transient=True, disable=quiet)
 
 
 def _complain(error: CanopyError) -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import numba
+from canopy_skel import kernels
 
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "mcap", "protobuf")
 ENOUGH_MEMORY = 2 << 30
@@ -73,7 +73,7 @@ def _disk(folder: Path) -> Finding:
 
 def _kernel_cache() -> Finding:
     """Kernels are compiled once, if their cache can be written."""
-    folder = Path(numba.config.CACHE_DIR or Path(__file__).parents[1] / "canopy_skel" / "kernels")
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(kernels.__file__).parent)
     try:
         with tempfile.NamedTemporaryFile(dir=folder):
             return Finding("kernel cache", True, f"{folder} can be written")

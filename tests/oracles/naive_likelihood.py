@@ -6,7 +6,7 @@ import numpy as np
 
 
 def likelihood(segments, voxel_size_m, k, max_confidence, low, high):
-    """p_l of all voxels in [low, high) by equations 1 and 2, rule 1 for voxels the segment meets."""
+    """p_l of all voxels in [low, high) by equations 1 and 2, rule 1 where the segment passes."""
     p = np.zeros(np.subtract(high, low))
     pieces = zip(
         segments.starts_in_base,

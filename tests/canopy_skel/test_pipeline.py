@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+from scenes.wood import WOOD, view_from
+
+from canopy_skel.document import Method, build_document, to_json
+from canopy_skel.errors import UsageError, ViewError
+from canopy_skel.frame import View
+from canopy_skel.likelihood import LikelihoodConfig
+from canopy_skel.pipeline import METHODS, MethodConfig, Skeletonizer
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [view_from(0), view_from(1, y=0.1), view_from(2, z=0.1)]
+
+
+def skeletonizer(name="paper", voxel=0.005, **kwargs):
+    config = MethodConfig(name=name, likelihood=LikelihoodConfig(voxel_size_m=voxel))
+    return Skeletonizer(RecordedSegmenter(), config, **kwargs)
+
+
+def bytes_of(maker):
+    graph = maker.skeleton().graph
+    method = Method(name="paper")
+    used = len(maker.views)
+    return to_json(
+        build_document(graph, scan_id="s", revision=used, method=method, views_used=used)
+    )
+
+
+def to_segment(points, start, end):
+    start, end = np.array(start), np.array(end)
+    along = np.clip((points - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    return np.linalg.norm(points - start - along[:, None] * (end - start), axis=1)
+
+
+def test_the_skeleton_lies_in_the_wood_and_bridges_the_gap(views):
+    maker = skeletonizer()
+    assert [maker.add_view(view) for view in views] == [3, 3, 3]
+    extraction = maker.skeleton()
+    graph = extraction.graph
+    off = np.min([to_segment(graph.vertices_in_base, s, e) for s, e, _ in WOOD], axis=0)
+    assert off[~graph.occluded].max() < 0.012
+    assert graph.components()[0] == 1
+    assert len(extraction.joins) == extraction.observed_components - 1
+    bridged = graph.vertices_in_base[graph.occluded]
+    assert to_segment(bridged, (1.0, 0.0, 0.0), (1.0, 0.3, 0.14)).max() < 0.02
+    assert ((0.19 < bridged[:, 1]) & (bridged[:, 1] < 0.23)).any()
+
+
+def test_the_order_of_views_does_not_matter_to_the_byte(views):
+    one, other = skeletonizer(), skeletonizer()
+    for view in views:
+        one.add_view(view)
+    for view in reversed(views):
+        other.add_view(view)
+    assert bytes_of(one) == bytes_of(other)
+
+
+def test_asking_in_between_and_adding_twice_changes_nothing(views):
+    one, other = skeletonizer(), skeletonizer()
+    for view in views:
+        one.add_view(view)
+        one.skeleton()
+        one.add_view(view)
+        other.add_view(view)
+    assert one.views == (0, 1, 2)
+    assert bytes_of(one) == bytes_of(other)
+
+
+def test_moving_the_camera_rig_by_whole_voxels_moves_the_skeleton(views):
+    shift = np.array([8, -24, 16]) * 0.0078125
+    here, there = skeletonizer(voxel=0.0078125), skeletonizer(voxel=0.0078125)
+    for view in views:
+        moved = view.base_from_camera.copy()
+        moved[:3, 3] += shift
+        here.add_view(view)
+        there.add_view(
+            View(
+                **{name: getattr(view, name) for name in View.__slots__}
+                | {"base_from_camera": moved}
+            )
+        )
+    one, other = here.skeleton().graph, there.skeleton().graph
+    np.testing.assert_allclose(other.vertices_in_base, one.vertices_in_base + shift, atol=1e-6)
+    np.testing.assert_array_equal(one.edges, other.edges)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_gives_a_forest(views, name):
+    maker = skeletonizer(name)
+    for view in views:
+        maker.add_view(view)
+    graph = maker.skeleton().graph
+    count, _ = graph.components()
+    assert len(graph.edges) == len(graph.vertices_in_base) - count > 50
+    assert graph.occluded.any()
+
+
+def test_views_without_wood_give_an_empty_skeleton():
+    maker = skeletonizer()
+    maker.add_view(view_from(0, instances=np.zeros((240, 320), np.uint16)))
+    extraction = maker.skeleton()
+    assert len(extraction.graph.vertices_in_base) == 0
+    assert extraction.voxels == 0
+
+
+def test_a_view_that_cannot_be_used_costs_the_others_nothing(views):
+    maker, alone = skeletonizer(), skeletonizer()
+    maker.add_view(views[0])
+    alone.add_view(views[0])
+    with pytest.raises(ViewError, match=r"view 1: /camera/branches/instances holds instance 3"):
+        maker.add_view(view_from(1, scores=(0.9,)))
+    assert maker.views == (0,)
+    assert bytes_of(maker) == bytes_of(alone)
+
+
+def test_an_unknown_method_names_the_known_ones():
+    with pytest.raises(UsageError, match="unknown method 'best': choose one of paper, mst, ftsem"):
+        MethodConfig(name="best")
+
+
+def test_the_configuration_hash_names_the_settings():
+    assert MethodConfig().sha256() == MethodConfig().sha256()
+    other = MethodConfig(likelihood=LikelihoodConfig(voxel_size_m=0.01))
+    assert MethodConfig().sha256() != other.sha256()
