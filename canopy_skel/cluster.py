@@ -38,7 +38,7 @@ class ClusterConfig:
     min_trusted_share: float = 0.4
     connect_m: float = 0.03
     min_points: int = 20
-    max_flatness: float = 0.6
+    max_flatness: float = 0.55
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

@@ -24,7 +24,7 @@ class InitialConfig:
     """
 
     smoothing_steps: int = 3
-    bandwidth_m: float = 0.01
+    bandwidth_m: float = 0.012
     max_angle_deg: float = 45.0
     spur_m: float = 0.02
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
-from canopy_skel.kernels import ellipsoid, search
+from canopy_skel.kernels import search
 from canopy_skel.likelihood import LikelihoodGrid, VoxelIndex, voxels_of
 
 
@@ -44,7 +44,7 @@ def search_paths(graph: SkeletonGraph, grid: LikelihoodGrid, index: VoxelIndex) 
     )
     paths = np.split(nodes, starts[1:]) if len(starts) else []
     return [
-        Join(cost_nat=float(cost) / ellipsoid.UNITS_PER_NAT, nodes=path)
+        Join(cost_nat=float(cost) / search.UNITS_PER_NAT, nodes=path)
         for cost, path in zip(costs, paths, strict=True)
     ]
 

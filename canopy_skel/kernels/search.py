@@ -1,8 +1,9 @@
 """Algorithm 1 of the paper, exact, by one multi-source search that is repaired after each join.
 
-A distance is one int64: cost in 1/65536 nat above LENGTH_BITS bits of path length (100, 141 or 173
-per step). So ties are broken by length, then by the lower predecessor, and cost plateaus (p = 1)
-cannot make a path wander.
+A distance is one int64: cost in units of 2^-36 nat above LENGTH_BITS bits of path length (5, 7 or 9
+per step, near enough to 1 : sqrt 2 : sqrt 3). The fine unit keeps a saturated map (p near 1) from
+being a plateau: paths still follow its ridges. Ties are broken by length, then by the lower
+predecessor, so nothing wanders.
 """
 
 import heapq
@@ -18,15 +19,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
-LENGTH_BITS = 28
+UNITS_PER_NAT = 1 << 36
+LENGTH_BITS = 15
+STEP_LENGTH = (0, 5, 7, 9)
 UNREACHED = 1 << 62
-STEP_LENGTH = (0, 100, 141, 173)
 
 
 @njit(cache=True)
 def edge_weight(q_u: float, q_v: float, step: int) -> int:
     """Return -log((p_u + p_v) / 2) (paper eq. 4) with its length, from q = 1 - p."""
-    cost: int = round(-math.log1p(-0.5 * (q_u + q_v)) * 65536.0)
+    cost: int = round(-math.log1p(-0.5 * (q_u + q_v)) * UNITS_PER_NAT)
     return (cost << LENGTH_BITS) + STEP_LENGTH[step]
 
 
@@ -155,7 +157,7 @@ def join_components(
     the component of each.
 
     Returns the nodes of all paths, one after the other, each from source to source; the first
-    index of each path; the cost of each path in 1/65536 nat.
+    index of each path; the cost of each path in 2^-36 nat.
     """
     distance = np.full(len(voxels), UNREACHED)
     previous = np.full(len(voxels), -1, dtype=np.int32)

@@ -84,7 +84,7 @@ def test_costs_are_those_of_all_pairs_in_every_round(case):
     units, components = case
     _, joins, _, _ = search(units, components)
     costs = [cost for cost, _ in naive_pathsearch.join_costs(q_of(units), components)]
-    assert [round(join.cost_nat * 65536) for join in joins] == costs
+    assert [round(join.cost_nat * naive_pathsearch.UNITS_PER_NAT) for join in joins] == costs
 
 
 @given(small_maps())

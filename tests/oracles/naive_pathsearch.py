@@ -4,13 +4,14 @@ import heapq
 import math
 from itertools import combinations, product
 
-STEP_LENGTH = (0, 100, 141, 173)
+STEP_LENGTH = (0, 5, 7, 9)
+UNITS_PER_NAT = 1 << 36
 OFFSETS = [o for o in product((-1, 0, 1), repeat=3) if any(o)]
 
 
 def weight(q, u, v):
-    """(cost in 1/65536 nat, length): compared in this order, as the fast search does."""
-    cost = round(-math.log1p(-0.5 * (q[u] + q[v])) * 65536)
+    """(cost in 2^-36 nat, length): compared in this order, as the fast search does."""
+    cost = round(-math.log1p(-0.5 * (q[u] + q[v])) * UNITS_PER_NAT)
     return cost, STEP_LENGTH[sum(abs(a - b) for a, b in zip(u, v, strict=True))]
 
 
