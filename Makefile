@@ -1,11 +1,12 @@
 # `make demo` and `make test` need nothing but python3 (>= 3.11) with venv: each sets up .venv itself.
 PYTHON ?= python3
+RECORDING ?= recordings/demo_apple.mcap
 VENV := .venv
 BIN := $(VENV)/bin
 VALIDATOR := $(VENV)/gltf_validator
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test check bench results
+.PHONY: setup demo test check bench results figures
 
 setup: $(READY)
 
@@ -35,3 +36,7 @@ bench: $(READY)
 
 results: $(READY)
 	$(BIN)/python benchmarks/recordings.py ../shared/data/recordings --output docs/results.md
+
+# The figures of docs/method.md; the ones in the repository are of a longer recording.
+figures: $(READY)
+	$(BIN)/python docs/figures.py $(RECORDING) --output docs/images/method
