@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 VALIDATOR := $(VENV)/gltf_validator
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test check bench results figures
+.PHONY: setup demo test check bench results departures figures
 
 setup: $(READY)
 
@@ -21,6 +21,8 @@ $(READY): pyproject.toml constraints.txt tests/gltf_validator/package-lock.json
 
 demo: $(READY)
 	$(BIN)/canopy replay recordings/demo_apple.mcap -o out --method paper --segmenter recorded
+	@echo "The skeleton: out/demo_apple.skeleton.json, and for viewers out/demo_apple.skeleton.glb"
+	@echo "Its picture:  out/demo_apple.overlay.png"
 
 test: $(READY)
 	$(BIN)/python -m pytest
@@ -36,6 +38,9 @@ bench: $(READY)
 
 results: $(READY)
 	$(BIN)/python benchmarks/recordings.py ../shared/data/recordings --output docs/results.md
+
+departures: $(READY)
+	$(BIN)/python benchmarks/departures.py ../shared/data/recordings --output docs/departures.md
 
 # The figures of docs/method.md; the ones in the repository are of a longer recording.
 figures: $(READY)
