@@ -1,6 +1,6 @@
 """What each departure from the paper is worth: one setting changed at a time, on given recordings.
 
-    python benchmarks/departures.py ../shared/data/recordings --output docs/departures.md
+python benchmarks/departures.py ../shared/data/recordings --output docs/departures.md
 """
 
 import argparse

@@ -8,9 +8,16 @@ from canopy_skel.errors import UsageError
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments
 
 VOXEL = 0.01
-# Off the voxel borders, where either side is right.
-coordinate = st.integers(-40, 40).map(lambda n: n * 1e-3 + 3.7e-4)
-point = st.tuples(coordinate, coordinate, coordinate)
+
+
+def coordinate(step, offset):
+    """Off the borders and edges of voxels, where either side is right."""
+    return st.integers(-40, 40).map(lambda n: n * step + offset)
+
+
+point = st.tuples(
+    coordinate(1e-3, 3.7e-4), coordinate(1.013e-3, 5.3e-4), coordinate(0.977e-3, 7.1e-4)
+)
 segment = st.tuples(point, point, st.sampled_from([0.002, 0.005, 0.01]), st.floats(0.05, 1.0))
 
 
