@@ -80,23 +80,59 @@ def radiance(
 ) -> Float32Array:
     """Return the (H, W, 3) linear light that reaches the lens."""
     light, mesh = scene.light, scene.mesh
-    out = np.empty((*picture.depth_m.shape, 3), dtype=np.float32)
+    fine = _doubled(intrinsics)
+    fine_screen = picture.screen * [2.0, 2.0, 1.0] + [0.5, 0.5, 0.0]
+    fine_inverse = ground_inverse_depth(base_from_camera, fine)
+    fine_triangle = np.full(fine_inverse.shape, -1, dtype=np.int32)
+    raster.draw(fine_screen, mesh.triangles, fine_inverse, fine_triangle)
+    furrow = scene.tree.species.colours.furrow
+    air = [furrow, light.cloud, light.haze_m, light.flash, TRUNK_X_M, ROW_PITCH_M]
     pinhole = [intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px]
-    settings = [
-        scene.tree.species.colours.furrow, light.cloud, light.haze_m, light.flash,
-        TRUNK_X_M, ROW_PITCH_M,
-    ]  # fmt: skip
+    out = np.empty((*picture.depth_m.shape, 3), dtype=np.float32)
     shade.shade(
-        picture.screen, mesh.triangles, mesh.normals, mesh.texture, mesh.kind, mesh.tone,
-        scene.radius_m, picture.triangle, picture.depth_m, np.ascontiguousarray(base_from_camera),
-        np.array(pinhole), light.sun_direction(), scene.sun_map.map_from_base, scene.sun_map.w,
-        scene.zenith_map.map_from_base, scene.zenith_map.w, scene.palette, np.array(settings), out,
-    )  # fmt: skip
+        shade.Surfaces(
+            screen=picture.screen,
+            triangles=mesh.triangles,
+            normals=mesh.normals,
+            coordinates=mesh.texture,
+            kind=mesh.kind,
+            tone=mesh.tone,
+            radius=scene.radius_m,
+        ),
+        shade.Lights(
+            sun=light.sun_direction(),
+            sun_map_from_base=scene.sun_map.map_from_base,
+            sun_map=scene.sun_map.w,
+            zenith_map_from_base=scene.zenith_map.map_from_base,
+            zenith_map=scene.zenith_map.w,
+            palette=scene.palette,
+        ),
+        shade.Lens(
+            base_from_camera=np.array(base_from_camera), pinhole=np.array(pinhole), air=np.array(air)
+        ),
+        picture.triangle,
+        1.0 / picture.depth_m,
+        fine_triangle,
+        fine_inverse,
+        out,
+    )
     return out
 
 
+def _doubled(intrinsics: Intrinsics) -> Intrinsics:
+    """Return the camera with twice as many pixels in the same frame."""
+    return Intrinsics(
+        fx_px=2 * intrinsics.fx_px,
+        fy_px=2 * intrinsics.fy_px,
+        cx_px=2 * intrinsics.cx_px + 0.5,
+        cy_px=2 * intrinsics.cy_px + 0.5,
+        width_px=2 * intrinsics.width_px,
+        height_px=2 * intrinsics.height_px,
+    )
+
+
 def develop(
-    linear: Float32Array, scene: Scene, rng: np.random.Generator, *, blur_px: float = 0.65
+    linear: Float32Array, scene: Scene, rng: np.random.Generator, *, blur_px: float = 0.45
 ) -> UInt8Array:
     """Return (H, W, 3) uint8 sRGB: lens blur, vignetting, exposure, photon and read noise."""
     light = scene.light
@@ -104,9 +140,9 @@ def develop(
     image = cv2.GaussianBlur(linear, (0, 0), blur_px)
     v, u = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     fall = (1 - 0.16 * (u * u + v * v)).astype(np.float32)
-    gain = 0.82 * light.exposure * float(np.exp(rng.normal(0, 0.04)))
+    gain = 0.95 * light.exposure * float(np.exp(rng.normal(0, 0.04)))
     image *= (gain * fall)[..., None] * np.array([light.white[0], 1, light.white[1]], np.float32)
-    image = image * (1 + image * 0.12) / (1 + image)
+    image = (1 - np.exp(-image)) ** np.float32(1.12)
     electrons = np.sqrt(np.maximum(image, 0) * 2.0e-4 + 1.2e-6)
     image += electrons * rng.standard_normal(image.shape, dtype=np.float32)
     np.clip(image, 0, 1, out=image)

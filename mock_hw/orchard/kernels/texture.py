@@ -124,11 +124,13 @@ def ground(palette: F64, x: float, y: float, distance: float, row_x: float, pitc
 def sky(palette: F64, x: float, y: float, z: float, cloud: float) -> Rgb:
     """Return the sky, or the far hedge, in a unit direction."""
     bearing = np.arctan2(y, x)
-    hedge = 0.035 + 0.05 * noise(bearing * 9, 1.0, 0.0) + 0.025 * noise(bearing * 45, 2.0, 0.0)
+    hedge = 0.02 + 0.05 * noise(bearing * 6, 1.0, 0.0) + 0.03 * noise(bearing * 26, 2.0, 0.0)
+    hedge += 0.012 * noise(bearing * 120, z * 60, 4.0)
     if z < hedge:
-        leafy = noise(bearing * 160, z * 160, 3.0)
-        dark = _scaled(row(palette, HEDGE), 0.55 + 0.7 * leafy)
-        return _mix(dark, row(palette, HORIZON), 0.35)
+        leafy = 0.6 * noise(bearing * 90, z * 110, 3.0) + 0.4 * noise(bearing * 260, z * 260, 5.0)
+        crown = noise(bearing * 26, 2.0, 0.0)
+        dark = _scaled(row(palette, HEDGE), 0.3 + 0.8 * leafy + 0.6 * crown)
+        return _mix(dark, row(palette, HORIZON), 0.12)
     height = min(max(z, 0.0) * 1.6, 1.0)
     base = _mix(row(palette, HORIZON), row(palette, SKY), height**0.6)
     s = 1.0 / (z + 0.12)
