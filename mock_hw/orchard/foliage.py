@@ -22,7 +22,7 @@ from mock_hw.orchard.scene import fixtures
 from mock_hw.orchard.tree import Tree
 
 DENSITIES = (1, 2, 3, 4)
-MOST_LEAVES = {"apple": 9000, "oak": 9000, "walnut": 2400}
+MOST_LEAVES = {"apple": 9000, "oak": 14000, "walnut": 2400}
 _STEPS = 11
 
 
@@ -98,7 +98,7 @@ def canopy_of(
 ) -> Canopy:
     """Draw a tree once for all leaf counts up to `most_leaves` (default poses: the 10 views)."""
     poses = camera_path(10) if poses is None else poses
-    bare = merged(fixtures(tree, seed, rows=False, trellis=trellis))
+    bare = merged(fixtures(tree, seed, trellis=trellis))
     leaves = mesh_of_leaves(tree, most_leaves)
     per_leaf = triangles_per_leaf(tree.species.leaf)
     vertices, covers = [], []

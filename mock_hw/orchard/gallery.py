@@ -13,9 +13,10 @@ from canopy_skel.geometry import FloatArray, invert, transform_points
 from mock_hw.orchard.foliage import DENSITIES, MOST_LEAVES, canopy_of, fit_canopy
 from mock_hw.orchard.light import fair_weather
 from mock_hw.orchard.path import look_at
+from mock_hw.orchard.presets import SPECIES
 from mock_hw.orchard.scene import build_scene
 from mock_hw.orchard.simulate import Camera, Options, prepare, render_view, trellised, truth, views
-from mock_hw.orchard.species import SPECIES, Species
+from mock_hw.orchard.species import Species
 from mock_hw.orchard.tree import TRUNK_X_M, Tree, grow
 
 TILE = (480, 300)
@@ -65,7 +66,7 @@ def sheet_of_views(species: Species, topology: int) -> UInt8Array:
             _truth_colours(view, truth(simulation), true_pose),
         ]
         caption = f"{species.name} FD{density}: {fit.leaf_count} leaves, V_det {fit.v_det:.2f}"
-        columns.append(np.vstack([_captioned(_fitted(tile, TILE), "") for tile in tiles]))
+        columns.append(np.vstack([_framed(_fitted(tile, TILE)) for tile in tiles]))
         _write(columns[-1], caption)
     return np.hstack(columns)
 
@@ -82,7 +83,7 @@ def sheet_of_profiles(species: Species, topologies: range) -> UInt8Array:
             _profile(tree, leaves, camera, pose)
             for leaves in (0, MOST_LEAVES[species.name] // 8, MOST_LEAVES[species.name] // 2)
         ]
-        columns.append(np.vstack([_captioned(_fitted(tile, PROFILE_TILE), "") for tile in tiles]))
+        columns.append(np.vstack([_framed(_fitted(tile, PROFILE_TILE)) for tile in tiles]))
         _write(columns[-1], f"{species.name} {topology}")
     return np.hstack(columns)
 
@@ -131,17 +132,15 @@ def _fitted(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).astype(np.uint8)
 
 
-def _captioned(tile: UInt8Array, text: str) -> UInt8Array:
+def _framed(tile: UInt8Array) -> UInt8Array:
     tile[-1:], tile[:, -1:] = 255, 255
-    _write(tile, text)
     return tile
 
 
 def _write(tile: UInt8Array, text: str) -> None:
-    for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            tile, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA
-        )
+    width = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0]
+    tile[:28, : width + 16] //= 3
+    cv2.putText(tile, text, (8, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 def _jpeg(image: UInt8Array) -> bytes:

@@ -88,7 +88,7 @@ def fragments_of(
     fragment, shown = pairs // len(piece), pairs % len(piece)
     step_px = _projected_steps(tree, base_from_camera, intrinsics)
     pixels = np.bincount(label[seen], minlength=count)
-    skeleton_m = np.bincount(fragment, minlength=count) * SPACING_M
+    skeleton_m = np.bincount(fragment, minlength=count).astype(np.float64) * SPACING_M
     length_px = np.bincount(fragment, weights=step_px[shown], minlength=count)
     width_px = pixels / np.maximum(length_px, 1e-9)
     detectable = (

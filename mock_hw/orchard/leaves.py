@@ -75,7 +75,8 @@ def _buds(tree: Tree, draw: FloatArray) -> IntArray:
     weight = bearing * (tree.along + 0.05) ** shape.tip_bias
     weight = weight * (tree.order > 0) + weight * (tree.order == 0) * (tree.along > 0.5)
     cumulative = np.cumsum(weight)
-    return np.searchsorted(cumulative, draw * cumulative[-1]).clip(0, len(weight) - 1)
+    found = np.searchsorted(cumulative, draw * cumulative[-1])
+    return np.asarray(np.minimum(found, len(weight) - 1), dtype=np.int64)
 
 
 def _attachment(
@@ -114,8 +115,14 @@ def _blade_faces(stations: int) -> IntArray:
                 quad = [(a, c, b), (a, d, c)]
             faces += [f for k, f in enumerate(quad) if not (i == 0 and k == 1)]
     last = stations - 1
-    return np.array([f for f in faces if not ({last, last + stations} <= set(f))
-                     and not ({last, last + 2 * stations} <= set(f))])
+    return np.array(
+        [
+            f
+            for f in faces
+            if not ({last, last + stations} <= set(f))
+            and not ({last, last + 2 * stations} <= set(f))
+        ]
+    )
 
 
 def _blade(
@@ -154,7 +161,7 @@ def _ribbon(end: FloatArray, width_m: float, pieces: int) -> tuple[FloatArray, F
     for k in range(pieces):
         a = 2 * k
         faces += [(a, a + 1, a + 3), (a, a + 3, a + 2)]
-    return rows.reshape(len(end), -1, 3), np.array(faces)
+    return rows.reshape(len(end), 2 * pieces + 2, 3), np.array(faces)
 
 
 Parts = tuple[FloatArray, FloatArray, FloatArray, IntArray]

@@ -10,7 +10,9 @@ from mock_hw.orchard.species import Rgb
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Light:
-    """sun_azimuth_deg: where the sun stands, from +x (behind the tree) to +y; 180 = behind
+    """Sun, sky, air and camera settings, the same for all views of a scan.
+
+    sun_azimuth_deg: where the sun stands, from +x (behind the tree) to +y; 180 = behind
     the camera. sun, sky, horizon: linear radiances. cloud: -0.3 clear … 0.5 overcast. haze_m:
     distance at which 63 % is haze. flash: strength of a lamp at the camera. exposure: of the
     camera. white: gain of the red and the blue channel (white balance off by as much).

@@ -126,8 +126,8 @@ def _bands(rings: int, sides: int) -> Int32Array:
     a, b = k * sides + i, k * sides + (i + 1) % sides
     quads = np.stack([a, b, b + sides, a, b + sides, a + sides], axis=-1).reshape(-1, 3)
     last = (rings - 1) * sides
-    i = np.arange(sides)
-    cap = np.stack([last + i, last + (i + 1) % sides, np.full(sides, rings * sides)], axis=-1)
+    rim = np.arange(sides)
+    cap = np.stack([last + rim, last + (rim + 1) % sides, np.full(sides, rings * sides)], axis=-1)
     return np.concatenate([quads, cap]).astype(np.int32)
 
 
@@ -190,5 +190,3 @@ def straight_tube(
     line = start + np.linspace(0, 1, pieces + 1)[:, None] * (end - start)
     label = np.full(pieces, -1, dtype=np.int32)
     return tube(line, np.full(pieces + 1, radius_m), label, kind, tone=0.5)
-
-

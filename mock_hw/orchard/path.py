@@ -11,9 +11,7 @@ from mock_hw.orchard.tree import TRUNK_X_M
 BASELINE_M = 0.075
 """Between left and right eye (OAK-D)."""
 
-OAK_D = Intrinsics(
-    fx_px=882.5, fy_px=882.5, cx_px=640.0, cy_px=400.0, width_px=1280, height_px=800
-)
+OAK_D = Intrinsics(fx_px=882.5, fy_px=882.5, cx_px=640.0, cy_px=400.0, width_px=1280, height_px=800)
 
 TOOL_FROM_CAMERA = transform_from(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, -0.045, 0.060]

@@ -36,9 +36,7 @@ def pose_noise_named(name: str) -> PoseNoise:
     return POSE_NOISE[name]
 
 
-def small_transform(
-    rng: np.random.Generator, sigma_m: float, sigma_deg: float
-) -> FloatArray:
+def small_transform(rng: np.random.Generator, sigma_m: float, sigma_deg: float) -> FloatArray:
     """Draw a (4, 4) transform near identity: a shift and a turn of these lengths on average.
 
     Each has a random direction and a normal length (root mean square: the given sigma).

@@ -51,7 +51,9 @@ def ground_inverse_depth(base_from_camera: FloatArray, intrinsics: Intrinsics) -
     u = np.arange(intrinsics.width_px) - intrinsics.cx_px
     v = np.arange(intrinsics.height_px) - intrinsics.cy_px
     down = base_from_camera[2, :3]
-    slope = down[2] + down[0] * u[None, :] / intrinsics.fx_px + down[1] * v[:, None] / intrinsics.fy_px
+    slope = (
+        down[2] + down[0] * u[None, :] / intrinsics.fx_px + down[1] * v[:, None] / intrinsics.fy_px
+    )
     inverse = slope / (GROUND_Z_M - base_from_camera[2, 3])
     return np.asarray(np.maximum(inverse, 0.0))
 
@@ -108,7 +110,9 @@ def radiance(
             palette=scene.palette,
         ),
         shade.Lens(
-            base_from_camera=np.array(base_from_camera), pinhole=np.array(pinhole), air=np.array(air)
+            base_from_camera=np.array(base_from_camera),
+            pinhole=np.array(pinhole),
+            air=np.array(air),
         ),
         picture.triangle,
         1.0 / picture.depth_m,
@@ -141,10 +145,11 @@ def develop(
     v, u = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     fall = (1 - 0.16 * (u * u + v * v)).astype(np.float32)
     gain = 0.95 * light.exposure * float(np.exp(rng.normal(0, 0.04)))
-    image *= (gain * fall)[..., None] * np.array([light.white[0], 1, light.white[1]], np.float32)
+    white = np.array([light.white[0], 1, light.white[1]], dtype=np.float32)
+    image = image * (gain * fall)[..., None] * white
     image = (1 - np.exp(-image)) ** np.float32(1.12)
-    electrons = np.sqrt(np.maximum(image, 0) * 2.0e-4 + 1.2e-6)
-    image += electrons * rng.standard_normal(image.shape, dtype=np.float32)
+    sigma = np.sqrt(np.maximum(image, 0) * 2.0e-4 + 1.2e-6)
+    image += sigma * rng.standard_normal(image.shape, dtype=np.float32)
     np.clip(image, 0, 1, out=image)
     low = image * 12.92
     high = 1.055 * np.power(image, 1 / 2.4) - 0.055

@@ -18,7 +18,7 @@ from mock_hw.orchard.tree import GROUND_Z_M, TRUNK_X_M, Tree
 _SUN_MAP_PX = 1536
 _SUN_MAP_M = 2.6
 _ZENITH_MAP_PX = 320
-_ROW_LEAVES = {"apple": 1400, "oak": 1500, "walnut": 260}
+_ROW_LEAVES = {"apple": (300, 1400), "oak": (150, 1500), "walnut": (100, 260)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -48,8 +48,8 @@ class Scene:
     zenith_map: ShadowMap
 
 
-def fixtures(tree: Tree, seed: int, *, rows: bool, trellis: bool) -> list[Mesh]:
-    """Return all meshes but the leaves; the wood of the tree comes first."""
+def fixtures(tree: Tree, seed: int, *, trellis: bool) -> list[Mesh]:
+    """Return what hides wood beside the leaves: wood (first), fruit, posts and wires."""
     rng = np.random.default_rng([seed, 3])
     parts = [mesh_of_wood(tree)]
     fruit = mesh_of_fruit(tree)
@@ -57,8 +57,6 @@ def fixtures(tree: Tree, seed: int, *, rows: bool, trellis: bool) -> list[Mesh]:
         parts.append(fruit)
     if trellis:
         parts.append(mesh_of_trellis(rng))
-    if rows:
-        parts.append(mesh_of_rows(tree.species, _ROW_LEAVES[tree.species.name], rng))
     return parts
 
 
@@ -66,7 +64,10 @@ def build_scene(
     tree: Tree, leaf_count: int, light: Light, *, seed: int, rows: bool = True, trellis: bool = True
 ) -> Scene:
     """Put a tree with `leaf_count` leaves into its surroundings."""
-    parts = fixtures(tree, seed, rows=rows, trellis=trellis)
+    parts = fixtures(tree, seed, trellis=trellis)
+    if rows:
+        leaves = int(np.clip(leaf_count, *_ROW_LEAVES[tree.species.name]))
+        parts.append(mesh_of_rows(tree.species, leaves, np.random.default_rng([seed, 7])))
     mesh = merged([*parts, mesh_of_leaves(tree, leaf_count)])
     radius = np.where(mesh.vertex >= 0, tree.radius_m[mesh.vertex], 0.012).astype(np.float32)
     return Scene(

@@ -103,9 +103,7 @@ def _smeared_edges(
     return np.where(take, nearer, np.where(mix, mixed, disparity))
 
 
-def _correlated(
-    shape: tuple[int, ...], rng: np.random.Generator, noise: StereoNoise
-) -> FloatArray:
+def _correlated(shape: tuple[int, ...], rng: np.random.Generator, noise: StereoNoise) -> FloatArray:
     """Return unit normal noise, averaged over a square window."""
     size = noise.correlation_px
     field = cv2.blur(rng.standard_normal(shape), (size, size), borderType=cv2.BORDER_REFLECT)

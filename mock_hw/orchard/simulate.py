@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, field, replace
 import cv2
 import numpy as np
 
+from canopy_skel.document import SkeletonDocument
 from canopy_skel.errors import UsageError
 from canopy_skel.frame import Intrinsics, StereoPair, UInt8Array, View
-from canopy_skel.document import SkeletonDocument
 from canopy_skel.geometry import FloatArray, invert, transform_from
 from mock_hw.orchard import renderer
 from mock_hw.orchard.foliage import FoliageFit, fit_foliage, framed
@@ -16,10 +16,11 @@ from mock_hw.orchard.instances import Fragments, fragments_of, instances_of
 from mock_hw.orchard.light import any_weather, fair_weather
 from mock_hw.orchard.path import BASELINE_M, OAK_D, TOOL_FROM_CAMERA, camera_path
 from mock_hw.orchard.pose_noise import pose_noise_named, small_transform
+from mock_hw.orchard.presets import species_named
 from mock_hw.orchard.renderer import Picture
 from mock_hw.orchard.scene import Scene, build_scene
 from mock_hw.orchard.sensor import StereoNoise, TrueDepth, perfect_depth, stereo_depth
-from mock_hw.orchard.species import Species, species_named
+from mock_hw.orchard.species import Species
 from mock_hw.orchard.tree import Tree, grow
 from mock_hw.orchard.truth import nothing_seen, seen_also, truth_document
 from mock_hw.orchard.wind import swayed
@@ -122,9 +123,7 @@ def prepare(options: Options, fit: FoliageFit | None = None) -> Simulation:
         tree, leaf_count, light, seed=surroundings_seed, rows=options.rows, trellis=trellis
     )
     rng = _rng(options, 1)
-    tool_from_camera = TOOL_FROM_CAMERA @ small_transform(
-        rng, noise.hand_eye_m, noise.hand_eye_deg
-    )
+    tool_from_camera = TOOL_FROM_CAMERA @ small_transform(rng, noise.hand_eye_m, noise.hand_eye_deg)
     reported = []
     for pose in true_poses:
         base_from_tool = pose @ invert(TOOL_FROM_CAMERA)

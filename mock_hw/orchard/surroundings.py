@@ -60,6 +60,6 @@ def mesh_of_trellis(rng: np.random.Generator) -> Mesh:
         parts.append(straight_tube(ends[0], ends[1], 0.0015, Kind.WIRE, piece_m=0.25))
     for side in (-1.0, 1.0):
         foot = np.array([TRUNK_X_M + 0.02, side * rng.uniform(1.0, 1.7), GROUND_Z_M])
-        top = foot + [rng.normal(0, 0.02), rng.normal(0, 0.02), 1.95]
+        top = foot + np.array([rng.normal(0, 0.02), rng.normal(0, 0.02), 1.95])
         parts.append(straight_tube(foot, top, rng.uniform(0.03, 0.045), Kind.POST, piece_m=0.5))
     return merged(parts)

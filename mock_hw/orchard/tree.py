@@ -17,7 +17,7 @@ SPACING_M = 0.008
 TRUNK_X_M = 1.70
 GROUND_Z_M = -0.95
 TOP_Z_M = 0.87
-CLEARANCE_M = 0.22
+CLEARANCE_M = 0.42
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -145,7 +145,7 @@ def _centreline(growth: Growth, bud: _Bud, rng: np.random.Generator) -> FloatArr
     for step in range(steps):
         pull = growth.rise * UP + growth.hold * bud.heading
         if point[2] < GROUND_Z_M + CLEARANCE_M and bud.parent is not None:
-            pull = pull + 6.0 * UP
+            pull = pull + 4.0 * UP
         heading = heading + SPACING_M * (pull - (pull @ heading) * heading)
         heading = heading + kinks[step] - (kinks[step] @ heading) * heading
         heading = heading / np.linalg.norm(heading)
@@ -194,9 +194,7 @@ def _side_buds(
     places = (np.arange(count) + rng.uniform(0.2, 0.8, count)) / max(count, 1)
     if species.forked and branch.order == 0 and count:
         places[-1] = 1.0
-    azimuth = rng.uniform(0, 360) + np.cumsum(
-        growth.whorl_deg + rng.normal(0, 18.0, count)
-    )
+    azimuth = rng.uniform(0, 360) + np.cumsum(growth.whorl_deg + rng.normal(0, 18.0, count))
     spread = rng.standard_normal((count, 2))
     own_vertices = branch.vertices if branch.parent is None else branch.vertices[1:]
     buds = []
@@ -223,7 +221,9 @@ def _side_buds(
     return buds
 
 
-def _base_radius(species: Species, growth: Growth, length_m: float, parent_radius_m: float) -> float:
+def _base_radius(
+    species: Species, growth: Growth, length_m: float, parent_radius_m: float
+) -> float:
     wanted = species.tip_radius_m + growth.stoutness * length_m
     return max(min(wanted, growth.radius_share * parent_radius_m), species.tip_radius_m)
 

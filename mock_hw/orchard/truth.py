@@ -15,9 +15,10 @@ LEAST_SEEN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Seen:
-    """What views saw of a tree. pixels: (V,) most pixels of a vertex in one view;
-    segmented: (V,) some instance covers it.
-    """  # noqa: D205
+    """What views saw of a tree.
+
+    pixels: (V,) most pixels of a vertex in one view. segmented: (V,) some instance covers it.
+    """
 
     pixels: IntArray
     segmented: BoolArray

@@ -6,7 +6,41 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
+Corners = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@njit(cache=True)
+def _corners(screen: F64, triangle: I32) -> Corners:
+    a, b, c = screen[triangle[0]], screen[triangle[1]], screen[triangle[2]]
+    return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+
+
+@njit(cache=True)
+def _box(corners: Corners, height: int, width: int) -> tuple[int, int, int, int, float]:
+    """Return the pixel rows and columns of a triangle (ends open) and its doubled area."""
+    ua, va, wa, ub, vb, wb, uc, vc, wc = corners
+    if wa == 0.0 or wb == 0.0 or wc == 0.0:
+        return 0, 0, 0, 0, 1.0
+    v0 = max(int(np.ceil(min(va, vb, vc))), 0)
+    v1 = min(int(np.floor(max(va, vb, vc))) + 1, height)
+    u0 = max(int(np.ceil(min(ua, ub, uc))), 0)
+    u1 = min(int(np.floor(max(ua, ub, uc))) + 1, width)
+    area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
+    if area == 0.0:
+        return 0, 0, 0, 0, 1.0
+    return v0, v1, u0, u1, area
+
+
+@njit(cache=True)
+def _w_at(corners: Corners, inverse_area: float, u: int, v: int) -> float:
+    """Return w at a pixel, 0 outside the triangle."""
+    ua, va, wa, ub, vb, wb, uc, vc, wc = corners
+    b = ((u - ua) * (vc - va) - (uc - ua) * (v - va)) * inverse_area
+    c = ((ub - ua) * (v - va) - (u - ua) * (vb - va)) * inverse_area
+    a = 1.0 - b - c
+    if a < 0.0 or b < 0.0 or c < 0.0:
+        return 0.0
+    return a * wa + b * wb + c * wc
 
 
 @njit(cache=True)
@@ -14,36 +48,19 @@ def draw(screen: F64, triangles: I32, w_buffer: F64, id_buffer: I32) -> None:
     """Draw all triangles; the nearest wins, at equal depth the first.
 
     Args:
-        screen: (P, 3) u, v in pixels and w, linear on screen (1/z, or minus the distance of a
-            parallel projection); a triangle with a w of 0 (behind the camera) is left out.
+        screen: (P, 3) u, v in pixels and w > 0, linear on screen (1/z, or a constant minus the
+            distance in a parallel projection); w = 0 marks points to be left out.
         triangles: (T, 3).
         w_buffer: (H, W), starts at the w of the far end.
         id_buffer: (H, W), gets the triangle's number.
     """
     height, width = id_buffer.shape
     for t in range(len(triangles)):
-        ia, ib, ic = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        ua, va, wa = screen[ia, 0], screen[ia, 1], screen[ia, 2]
-        ub, vb, wb = screen[ib, 0], screen[ib, 1], screen[ib, 2]
-        uc, vc, wc = screen[ic, 0], screen[ic, 1], screen[ic, 2]
-        if wa == 0.0 or wb == 0.0 or wc == 0.0:
-            continue
-        v0 = max(int(np.ceil(min(va, vb, vc))), 0)
-        v1 = min(int(np.floor(max(va, vb, vc))), height - 1)
-        u0 = max(int(np.ceil(min(ua, ub, uc))), 0)
-        u1 = min(int(np.floor(max(ua, ub, uc))), width - 1)
-        area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-        if v0 > v1 or u0 > u1 or area == 0.0:
-            continue
-        inverse = 1.0 / area
-        for v in range(v0, v1 + 1):
-            for u in range(u0, u1 + 1):
-                b = ((u - ua) * (vc - va) - (uc - ua) * (v - va)) * inverse
-                c = ((ub - ua) * (v - va) - (u - ua) * (vb - va)) * inverse
-                a = 1.0 - b - c
-                if a < 0.0 or b < 0.0 or c < 0.0:
-                    continue
-                w = a * wa + b * wb + c * wc
+        corners = _corners(screen, triangles[t])
+        v0, v1, u0, u1, area = _box(corners, height, width)
+        for v in range(v0, v1):
+            for u in range(u0, u1):
+                w = _w_at(corners, 1.0 / area, u, v)
                 if w > w_buffer[v, u]:
                     w_buffer[v, u] = w
                     id_buffer[v, u] = t
@@ -58,29 +75,10 @@ def first_cover(screen: F64, triangles: I32, per_leaf: int, w_buffer: F64, cover
     """
     height, width = cover.shape
     for t in range(len(triangles)):
-        ia, ib, ic = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        ua, va, wa = screen[ia, 0], screen[ia, 1], screen[ia, 2]
-        ub, vb, wb = screen[ib, 0], screen[ib, 1], screen[ib, 2]
-        uc, vc, wc = screen[ic, 0], screen[ic, 1], screen[ic, 2]
-        if wa == 0.0 or wb == 0.0 or wc == 0.0:
-            continue
         leaf = t // per_leaf
-        v0 = max(int(np.ceil(min(va, vb, vc))), 0)
-        v1 = min(int(np.floor(max(va, vb, vc))), height - 1)
-        u0 = max(int(np.ceil(min(ua, ub, uc))), 0)
-        u1 = min(int(np.floor(max(ua, ub, uc))), width - 1)
-        area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-        if v0 > v1 or u0 > u1 or area == 0.0:
-            continue
-        inverse = 1.0 / area
-        for v in range(v0, v1 + 1):
-            for u in range(u0, u1 + 1):
-                if cover[v, u] <= leaf:
-                    continue
-                b = ((u - ua) * (vc - va) - (uc - ua) * (v - va)) * inverse
-                c = ((ub - ua) * (v - va) - (u - ua) * (vb - va)) * inverse
-                a = 1.0 - b - c
-                if a < 0.0 or b < 0.0 or c < 0.0:
-                    continue
-                if a * wa + b * wb + c * wc > w_buffer[v, u]:
+        corners = _corners(screen, triangles[t])
+        v0, v1, u0, u1, area = _box(corners, height, width)
+        for v in range(v0, v1):
+            for u in range(u0, u1):
+                if cover[v, u] > leaf and _w_at(corners, 1.0 / area, u, v) > w_buffer[v, u]:
                     cover[v, u] = leaf

@@ -124,9 +124,9 @@ def _albedo(
     """Return the reflectance of a mesh face."""
     kind, tone = surfaces.kind[t], surfaces.tone[t]
     s = _blend(surfaces.coordinates, surfaces.triangles[t], weights)
-    if kind == _WOOD or kind == _FAR_WOOD:
+    if kind in (_WOOD, _FAR_WOOD):
         return texture.bark(palette, furrow, s[0], s[1], s[2], surfaces.radius[t], tone)
-    if kind == _LEAF or kind == _FAR_LEAF:
+    if kind in (_LEAF, _FAR_LEAF):
         return texture.leaf(palette, side, s[0], s[1], s[2], tone)
     if kind == _FRUIT:
         return texture.fruit(palette, s[0], s[1], s[2], tone)
@@ -153,13 +153,21 @@ def _sheen(n: Vec, sun: F64, ray: Vec) -> float:
     """Return the mirror part of sunlight (Blinn-Phong)."""
     h = (sun[0] - ray[0], sun[1] - ray[1], sun[2] - ray[2])
     cosine = _dot(n, h) / np.sqrt(_dot(h, h))
-    return 0.16 * max(cosine, 0.0) ** 30
+    return float(0.16 * max(cosine, 0.0) ** 30)
 
 
 @njit(cache=True)
 def _lit(
-    lights: Lights, flash: float, what: int, side: int, tone: float, albedo: Vec, n: Vec,
-    p: Vec, ray: Vec, distance: float,
+    lights: Lights,
+    flash: float,
+    what: int,
+    side: int,
+    tone: float,
+    albedo: Vec,
+    n: Vec,
+    p: Vec,
+    ray: Vec,
+    distance: float,
 ) -> Vec:
     """Return the light a surface point sends to the lens: sun, sky, ground, lamp."""
     palette, sun = lights.palette, lights.sun
@@ -168,9 +176,9 @@ def _lit(
     else:
         shadow, open_sky = _sunlit(lights, p), _open_sky(lights, p)
     direct = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
-    leafy = what == _LEAF or what == _FAR_LEAF
+    leafy = what in (_LEAF, _FAR_LEAF)
     through = -direct * shadow * (0.5 + 0.6 * tone) if leafy and direct < 0 else 0.0
-    glossy = (leafy and side == texture.ABOVE) or what == _FRUIT or what == _WIRE
+    glossy = (leafy and side == texture.ABOVE) or what in (_FRUIT, _WIRE)
     mirror = _sheen(n, sun, ray) * shadow if glossy else 0.0
     lamp = flash * max(-_dot(n, ray), 0.0) / distance**2
     sun_rgb = texture.row(palette, texture.SUN)
@@ -179,15 +187,14 @@ def _lit(
     glow = texture.row(palette, texture.THROUGH)
     up = 0.5 + 0.5 * n[2]
     direct = max(direct, 0.0) * shadow
-    r, g, b = 0.0, 0.0, 0.0
+    out = np.empty(3)
     for k in range(3):
-        ambient = (0.6 * sky_rgb[k] + 0.4 * rim[k]) * up * open_sky
-        ambient += (1 - up) * 1.2 * below[k] * (sun_rgb[k] + rim[k]) * open_sky
-        value = albedo[k] * (sun_rgb[k] * direct + ambient + lamp)
-        value += sun_rgb[k] * (glow[k] * through + mirror)
-        value += glossy * 0.02 * sky_rgb[k] * up * open_sky
-        r, g, b = (value if k == 0 else r), (value if k == 1 else g), (value if k == 2 else b)
-    return r, g, b
+        sky_light = (0.6 * sky_rgb[k] + 0.4 * rim[k]) * up * open_sky
+        ground_light = (1 - up) * 1.2 * below[k] * (sun_rgb[k] + rim[k]) * open_sky
+        out[k] = albedo[k] * (sun_rgb[k] * direct + sky_light + ground_light + lamp)
+        out[k] += sun_rgb[k] * (glow[k] * through + mirror)
+        out[k] += glossy * 0.02 * sky_rgb[k] * up * open_sky
+    return out[0], out[1], out[2]
 
 
 @njit(cache=True)
@@ -237,15 +244,19 @@ def _alike(surfaces: Surfaces, a: int, b: int) -> bool:
     """Say whether two triangles belong to one object, so that no edge runs between them."""
     if a < 0 or b < 0:
         return a == b
-    return a == b or (
-        surfaces.kind[a] == surfaces.kind[b] and surfaces.tone[a] == surfaces.tone[b]
-    )
+    return a == b or (surfaces.kind[a] == surfaces.kind[b] and surfaces.tone[a] == surfaces.tone[b])
 
 
 @njit(cache=True)
 def shade(
-    surfaces: Surfaces, lights: Lights, lens: Lens, triangle: I32, w: F64, fine_triangle: I32,
-    fine_w: F64, out: F32,
+    surfaces: Surfaces,
+    lights: Lights,
+    lens: Lens,
+    triangle: I32,
+    w: F64,
+    fine_triangle: I32,
+    fine_w: F64,
+    out: F32,
 ) -> None:
     """Fill `out` (H, W, 3) with linear radiance.
 

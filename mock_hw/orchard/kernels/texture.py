@@ -30,10 +30,8 @@ def noise(x: float, y: float, z: float) -> float:
     low = _hash(i, j, k) * (1 - a) + _hash(i + 1, j, k) * a
     low = low * (1 - b) + (_hash(i, j + 1, k) * (1 - a) + _hash(i + 1, j + 1, k) * a) * b
     high = _hash(i, j, k + 1) * (1 - a) + _hash(i + 1, j, k + 1) * a
-    high = high * (1 - b) + (
-        _hash(i, j + 1, k + 1) * (1 - a) + _hash(i + 1, j + 1, k + 1) * a
-    ) * b
-    return low * (1 - c) + high * c
+    high = high * (1 - b) + (_hash(i, j + 1, k + 1) * (1 - a) + _hash(i + 1, j + 1, k + 1) * a) * b
+    return float(low * (1 - c) + high * c)
 
 
 @njit(cache=True)
