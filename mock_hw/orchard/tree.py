@@ -18,6 +18,7 @@ TRUNK_X_M = 1.70
 GROUND_Z_M = -0.95
 TOP_Z_M = 0.87
 CLEARANCE_M = 0.42
+HEDGE_M = 0.75
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -137,7 +138,10 @@ def _trunk_bud(species: Species, stream: np.random.SeedSequence) -> _Bud:
 
 
 def _centreline(growth: Growth, bud: _Bud, rng: np.random.Generator) -> FloatArray:
-    """Return the (N, 3) points of a branch, `SPACING_M` apart, above the ground, below the top."""
+    """Return the (N, 3) points of a branch, `SPACING_M` apart.
+
+    Wood that would reach above the top or into the alleys on either side is pruned.
+    """
     steps = max(round(bud.length_m / SPACING_M), 1)
     kinks = _kinks(growth, steps, rng)
     point, heading = bud.start, bud.heading
@@ -150,7 +154,7 @@ def _centreline(growth: Growth, bud: _Bud, rng: np.random.Generator) -> FloatArr
         heading = heading + kinks[step] - (kinks[step] @ heading) * heading
         heading = heading / np.linalg.norm(heading)
         point = point + SPACING_M * heading
-        if point[2] > TOP_Z_M:
+        if point[2] > TOP_Z_M or abs(point[0] - TRUNK_X_M) > HEDGE_M:
             break
         points.append(point)
     return np.array(points).reshape(-1, 3)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from canopy_skel.errors import UsageError
 from mock_hw.orchard.presets import APPLE, SPECIES, species_named
-from mock_hw.orchard.tree import GROUND_Z_M, SPACING_M, TOP_Z_M, TRUNK_X_M, grow
+from mock_hw.orchard.tree import GROUND_Z_M, HEDGE_M, SPACING_M, TOP_Z_M, TRUNK_X_M, grow
 
 any_tree = given(st.sampled_from(sorted(SPECIES)), st.integers(0, 2**31))
 
@@ -25,6 +25,7 @@ def test_every_tree_is_one_rooted_tree_of_evenly_spaced_vertices(name, seed):
     assert np.allclose(steps, SPACING_M)
     assert tree.position[0] == pytest.approx([TRUNK_X_M, 0, GROUND_Z_M])
     assert tree.position[1:, 2].min() > GROUND_Z_M
+    assert np.abs(tree.position[:, 0] - TRUNK_X_M).max() <= HEDGE_M
     assert 1.5 < tree.position[:, 2].max() - GROUND_Z_M <= TOP_Z_M - GROUND_Z_M
 
 
