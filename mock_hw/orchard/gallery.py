@@ -10,12 +10,13 @@ import numpy as np
 from canopy_skel.document import SkeletonDocument
 from canopy_skel.frame import Intrinsics, UInt8Array, UInt16Array, View
 from canopy_skel.geometry import FloatArray, invert, transform_points
+from mock_hw.orchard.camera import Camera, render_view
 from mock_hw.orchard.foliage import DENSITIES, MOST_LEAVES, canopy_of, fit_canopy
 from mock_hw.orchard.light import fair_weather
 from mock_hw.orchard.path import look_at
 from mock_hw.orchard.presets import SPECIES
 from mock_hw.orchard.scene import build_scene
-from mock_hw.orchard.simulate import Camera, Options, prepare, render_view, trellised, truth, views
+from mock_hw.orchard.simulate import Options, prepare, trellised, truth, views
 from mock_hw.orchard.species import Species
 from mock_hw.orchard.tree import TRUNK_X_M, Tree, grow
 

@@ -144,7 +144,7 @@ def develop(
     image = cv2.GaussianBlur(linear, (0, 0), blur_px)
     v, u = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     fall = (1 - 0.16 * (u * u + v * v)).astype(np.float32)
-    gain = 0.95 * light.exposure * float(np.exp(rng.normal(0, 0.04)))
+    gain = 1.08 * light.exposure * float(np.exp(rng.normal(0, 0.04)))
     white = np.array([light.white[0], 1, light.white[1]], dtype=np.float32)
     image = image * (gain * fall)[..., None] * white
     image = (1 - np.exp(-image)) ** np.float32(1.12)

@@ -3,44 +3,27 @@
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 
-import cv2
 import numpy as np
 
 from canopy_skel.document import SkeletonDocument
 from canopy_skel.errors import UsageError
-from canopy_skel.frame import Intrinsics, StereoPair, UInt8Array, View
-from canopy_skel.geometry import FloatArray, invert, transform_from
+from canopy_skel.frame import View
+from canopy_skel.geometry import FloatArray, invert
 from mock_hw.orchard import renderer
+from mock_hw.orchard.camera import Camera, fragments_in, render_view
 from mock_hw.orchard.foliage import FoliageFit, fit_foliage, framed
-from mock_hw.orchard.instances import Fragments, fragments_of, instances_of
 from mock_hw.orchard.light import any_weather, fair_weather
-from mock_hw.orchard.path import BASELINE_M, OAK_D, TOOL_FROM_CAMERA, camera_path
-from mock_hw.orchard.pose_noise import pose_noise_named, small_transform
+from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
+from mock_hw.orchard.pose_noise import PoseNoise, pose_noise_named, small_transform
 from mock_hw.orchard.presets import species_named
-from mock_hw.orchard.renderer import Picture
 from mock_hw.orchard.scene import Scene, build_scene
-from mock_hw.orchard.sensor import StereoNoise, TrueDepth, perfect_depth, stereo_depth
 from mock_hw.orchard.species import Species
-from mock_hw.orchard.tree import Tree, grow
+from mock_hw.orchard.tree import grow
 from mock_hw.orchard.truth import nothing_seen, seen_also, truth_document
 from mock_hw.orchard.wind import swayed
 
 FIRST_STAMP_NS = 1_760_000_000_000_000_000
 STEP_NS = 1_500_000_000
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Camera:
-    """The simulated stereo camera.
-
-    noise: None = perfect depth. depth: report a depth image. pair: report the stereo pair.
-    """
-
-    intrinsics: Intrinsics = OAK_D
-    baseline_m: float = BASELINE_M
-    noise: StereoNoise | None = field(default_factory=StereoNoise)
-    depth: bool = True
-    pair: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -122,21 +105,27 @@ def prepare(options: Options, fit: FoliageFit | None = None) -> Simulation:
     scene = build_scene(
         tree, leaf_count, light, seed=surroundings_seed, rows=options.rows, trellis=trellis
     )
-    rng = _rng(options, 1)
-    tool_from_camera = TOOL_FROM_CAMERA @ small_transform(rng, noise.hand_eye_m, noise.hand_eye_deg)
-    reported = []
-    for pose in true_poses:
-        base_from_tool = pose @ invert(TOOL_FROM_CAMERA)
-        base_from_tool = base_from_tool @ small_transform(rng, noise.view_m, noise.view_deg)
-        reported.append(base_from_tool @ tool_from_camera)
+    tool_from_camera, reported = _reported(true_poses, noise, _rng(options, 1))
     return Simulation(
         options=options,
         scene=scene,
         fit=fit if options.leaf_count is None else None,
         true_poses=tuple(true_poses),
-        reported_poses=tuple(reported),
+        reported_poses=reported,
         tool_from_camera=tool_from_camera,
     )
+
+
+def _reported(
+    true_poses: list[FloatArray], noise: PoseNoise, rng: np.random.Generator
+) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Return the hand-eye calibration the rig believes in, and the camera poses it reports."""
+    tool_from_camera = TOOL_FROM_CAMERA @ small_transform(rng, noise.hand_eye_m, noise.hand_eye_deg)
+    poses = []
+    for pose in true_poses:
+        drift = small_transform(rng, noise.view_m, noise.view_deg)
+        poses.append(pose @ invert(TOOL_FROM_CAMERA) @ drift @ tool_from_camera)
+    return tool_from_camera, tuple(poses)
 
 
 def trellised(species: Species) -> bool:
@@ -165,59 +154,13 @@ def truth(simulation: Simulation) -> SkeletonDocument:
     for index, pose in enumerate(simulation.true_poses):
         scene = _scene_at(simulation, index)
         picture = renderer.draw(scene.mesh, pose, intrinsics)
-        seen = seen_also(seen, picture.vertex, _fragments(scene, picture, pose, intrinsics))
+        seen = seen_also(seen, picture.vertex, fragments_in(scene, picture, pose, intrinsics))
     return truth_document(
         tree,
         seen,
         framed(tree, list(simulation.true_poses), intrinsics),
         scan_id=simulation.scan_id,
         views=len(simulation.true_poses),
-    )
-
-
-def render_view(
-    scene: Scene,
-    base_from_camera: FloatArray,
-    camera: Camera | None = None,
-    *,
-    index: int,
-    stamp_ns: int,
-    seed: int,
-) -> View:
-    """Return what the camera sees from any pose, with ground-truth instances.
-
-    The same scene, pose, index and seed give the same bytes.
-    """
-    camera = camera or Camera()
-    intrinsics = camera.intrinsics
-    rng = np.random.default_rng([seed, 4, index])
-    picture = renderer.draw(scene.mesh, base_from_camera, intrinsics)
-    linear = renderer.radiance(scene, picture, base_from_camera, intrinsics)
-    color = renderer.develop(linear, scene, rng)
-    right_pose = base_from_camera @ transform_from(np.eye(3), [camera.baseline_m, 0, 0])
-    right = renderer.draw(scene.mesh, right_pose, intrinsics)
-    fragments = _fragments(scene, picture, base_from_camera, intrinsics)
-    instances, scores = instances_of(fragments, rng)
-    depth = None
-    if camera.depth and camera.noise is None:
-        depth = perfect_depth(picture.depth_m)
-    elif camera.depth:
-        depth = stereo_depth(_true_depth(scene, picture, right, camera), rng, camera.noise)
-    stereo = None
-    if camera.pair:
-        right_linear = renderer.radiance(scene, right, right_pose, intrinsics)
-        right_color = renderer.develop(right_linear, scene, rng)
-        stereo = _pair(color, right_color, camera)
-    return View(
-        index=index,
-        stamp_ns=stamp_ns,
-        color_rgb=color,
-        intrinsics=intrinsics,
-        base_from_camera=np.array(base_from_camera),
-        depth_m=depth,
-        stereo=stereo,
-        instances=instances,
-        scores=scores,
     )
 
 
@@ -232,30 +175,3 @@ def _scene_at(simulation: Simulation, index: int) -> Scene:
         return scene
     rng = np.random.default_rng([simulation.options.seed, 6, index])
     return replace(scene, mesh=swayed(scene.mesh, scene.tree, reach, rng))
-
-
-def _fragments(
-    scene: Scene, picture: Picture, base_from_camera: FloatArray, intrinsics: Intrinsics
-) -> Fragments:
-    return fragments_of(picture.vertex, scene.tree, scene.piece, base_from_camera, intrinsics)
-
-
-def _true_depth(scene: Scene, left: Picture, right: Picture, camera: Camera) -> TrueDepth:
-    tree: Tree = scene.tree
-    noise = camera.noise or StereoNoise()
-    return TrueDepth(
-        left_m=left.depth_m,
-        right_m=right.depth_m,
-        kind=left.kind,
-        thin=(left.vertex >= 0) & (tree.radius_m[left.vertex] < noise.thin_m),
-        focal_baseline=camera.intrinsics.fx_px * camera.baseline_m,
-    )
-
-
-def _pair(left: UInt8Array, right: UInt8Array, camera: Camera) -> StereoPair:
-    return StereoPair(
-        left_mono=np.asarray(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY)),
-        right_mono=np.asarray(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
-        intrinsics=camera.intrinsics,
-        baseline_m=camera.baseline_m,
-    )

@@ -6,9 +6,10 @@ import pytest
 from canopy_skel.errors import UsageError
 from canopy_skel.geometry import invert
 from mock_hw.orchard import renderer
+from mock_hw.orchard.camera import Camera, render_view
 from mock_hw.orchard.mesh import Kind
 from mock_hw.orchard.path import TOOL_FROM_CAMERA
-from mock_hw.orchard.simulate import Camera, Options, prepare, render_view, truth, views
+from mock_hw.orchard.simulate import Options, prepare, truth, views
 from mock_hw.orchard.wind import compliance, swayed
 
 LEAVES = 150
