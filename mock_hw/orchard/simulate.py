@@ -87,8 +87,12 @@ def prepare(options: Options, fit: FoliageFit | None = None) -> Simulation:
     `fit` spares the bisection where the leaf count of the density is known already.
 
     Raises:
-        UsageError: an option is unknown.
+        UsageError: an option is unknown or negative.
     """
+    for name in ("topology", "seed", "leaf_count", "wind_m"):
+        value = getattr(options, name)
+        if value is not None and value < 0:
+            raise UsageError(f"{name} is {value}; give 0 or more")
     species = species_named(options.species)
     if options.weather not in ("fair", "any"):
         raise UsageError(f"unknown weather {options.weather!r}; choose fair or any")

@@ -167,6 +167,8 @@ def test_a_windy_scan_is_repeatable_and_differs_from_view_to_view(options):
         ({"species": "pear"}, "unknown species"),
         ({"weather": "hail"}, "unknown weather 'hail'; choose fair or any"),
         ({"noise": "awful"}, "unknown noise"),
+        ({"topology": -1}, "topology is -1; give 0 or more"),
+        ({"wind_m": -0.1}, "wind_m is -0.1; give 0 or more"),
         ({"views": 3}, "no camera path with 3 views"),
     ],
 )
