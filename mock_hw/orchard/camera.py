@@ -9,6 +9,7 @@ from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array, 
 from canopy_skel.geometry import FloatArray, transform_from
 from mock_hw.orchard import renderer
 from mock_hw.orchard.instances import Fragments, fragments_of, instances_of
+from mock_hw.orchard.mesh import Kind
 from mock_hw.orchard.path import BASELINE_M, OAK_D
 from mock_hw.orchard.renderer import Picture
 from mock_hw.orchard.scene import Scene
@@ -101,12 +102,12 @@ def _depth(
 ) -> Float32Array:
     if camera.noise is None:
         return perfect_depth(left.depth_m)
-    thin = scene.tree.radius_m[left.vertex] < camera.noise.thin_m
+    twig = (left.vertex >= 0) & (scene.tree.radius_m[left.vertex] < camera.noise.thin_m)
     true = TrueDepth(
         left_m=left.depth_m,
         right_m=right.depth_m,
         kind=left.kind,
-        thin=(left.vertex >= 0) & thin,
+        thin=twig | (left.kind == Kind.WIRE),
         focal_baseline=camera.intrinsics.fx_px * camera.baseline_m,
     )
     return stereo_depth(true, rng, camera.noise)

@@ -20,6 +20,7 @@ LEAST_PIXELS = 150
 LEAST_SKELETON_M = 0.05
 LEAST_WIDTH_PX = 2.5
 _WINDOW = 3
+_LEAST_VERTICES = 9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -56,7 +57,7 @@ def pieces_of(tree: Tree) -> IntArray:
         mean, since = heading[0], 0
         for k, vertex in enumerate(own):
             straight = heading[k] @ mean >= cosine * np.linalg.norm(mean)
-            if k - since >= 2 * _WINDOW and (not straight or forks[own[k - 1]]):
+            if k - since >= _LEAST_VERTICES and (not straight or forks[own[k - 1]]):
                 count, mean, since = count + 1, np.zeros(3), k
             piece[vertex] = count
             mean = mean + heading[k]

@@ -42,7 +42,7 @@ class StereoNoise:
 class TrueDepth:
     """What the matcher looks at: left_m, right_m (H, W) depth of either eye, inf in the sky.
 
-    kind: (H, W) of `Kind`; thin: (H, W) wood thinner than the model's `thin_m`.
+    kind: (H, W) of `Kind`; thin: (H, W) wires, and wood thinner than the model's `thin_m`.
     focal_baseline: f in pixels times the baseline in metres.
     """
 

@@ -19,6 +19,7 @@ GROUND_Z_M = -0.95
 TOP_Z_M = 0.87
 CLEARANCE_M = 0.42
 HEDGE_M = 0.75
+_SHORTEST = 6
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -90,7 +91,7 @@ def grow(species: Species, seed: int) -> Tree:
         bud = buds.popleft()
         shape_stream, bud_stream = bud.stream.spawn(2)
         line = _centreline(species.orders[bud.order], bud, np.random.default_rng(shape_stream))
-        if len(line) < 3:
+        if len(line) < _SHORTEST:
             continue
         along = np.linspace(0.0, 1.0, len(line))
         radius = _radii(species, bud, along)
