@@ -7,13 +7,14 @@ thinner one, and no leaf ever moves a branch.
 import numpy as np
 
 from canopy_skel.geometry import FloatArray, IntArray
-from mock_hw.orchard.mesh import Kind, Mesh, balls, merged
+from mock_hw.orchard.mesh import Kind, Mesh, balls
 from mock_hw.orchard.species import LeafShape
 from mock_hw.orchard.tree import UP, Tree
 
 _LEAF_STREAM = 1
 _FRUIT_STREAM = 2
 _DRAWS = 16
+_RACHIS_SHARE = 0.6
 
 
 def triangles_per_leaf(shape: LeafShape) -> int:
@@ -65,7 +66,7 @@ def mesh_of_fruit(tree: Tree) -> Mesh | None:
     drop = shape.stalk_m + radius * shape.flatness
     sideways = rng.normal(0, 0.3, (shape.count, 3)) * radius[:, None]
     centres = tree.position[vertex] - drop[:, None] * UP + sideways
-    return merged([balls(centres, radius, shape.flatness, vertex, rng.random(shape.count))])
+    return balls(centres, radius, shape.flatness, vertex, rng.random(shape.count))
 
 
 def _buds(tree: Tree, draw: FloatArray) -> IntArray:
@@ -106,23 +107,13 @@ def _attachment(
 
 def _blade_faces(stations: int) -> IntArray:
     """Return the faces of a blade whose points are midrib, left rim, right rim by station."""
-    faces = []
-    for i in range(stations - 1):
-        for rim in (stations, 2 * stations):
-            a, b, c, d = i, i + 1, rim + i + 1, rim + i
-            quad = [(a, b, c), (a, c, d)]
-            if rim == 2 * stations:
-                quad = [(a, c, b), (a, d, c)]
-            faces += [f for k, f in enumerate(quad) if not (i == 0 and k == 1)]
     last = stations - 1
-    return np.array(
-        [
-            f
-            for f in faces
-            if not ({last, last + stations} <= set(f))
-            and not ({last, last + 2 * stations} <= set(f))
-        ]
-    )
+    shared = {stations: 0, stations + last: last, 2 * stations: 0, 2 * stations + last: last}
+    faces = []
+    for rim in (stations, 2 * stations):
+        for i in range(last):
+            faces += [(i, i + 1, rim + i + 1), (i, rim + i + 1, rim + i)]
+    return np.array([f for f in faces if len({shared.get(corner, corner) for corner in f}) == 3])
 
 
 def _blade(
@@ -180,17 +171,13 @@ def _pinnate(
     shape: LeafShape, length: FloatArray, petiole: FloatArray, curl: FloatArray, fold: FloatArray
 ) -> Parts:
     """Build compound leaves: pairs of leaflets along a rachis and one at its end."""
-    pairs = (shape.leaflets - 1) // 2
-    rachis = petiole + 0.6 * length
+    rachis = petiole + _RACHIS_SHARE * length
     blades, sides = [], []
     for k in range(shape.leaflets):
-        place = 1.0 if k == shape.leaflets - 1 else (0.3 + 0.62 * (k // 2) / max(pairs - 1, 1))
-        size = 0.4 if k == shape.leaflets - 1 else 0.24 + 0.1 * (k // 2) / max(pairs - 1, 1)
-        angle = 0.0 if k == shape.leaflets - 1 else np.radians(62 - 8 * (k // 2)) * (-1) ** k
+        place, size, angle = _leaflet(k, shape.leaflets)
         blade, normals, texture = _blade(shape, size * length, curl, fold)
-        turn = np.array(
-            [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-        )
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         blade = blade @ turn
         blade[..., 0] += (place * rachis)[:, None]
         blades.append(blade)
@@ -199,6 +186,19 @@ def _pinnate(
     sag = parts[0][..., 0] ** 2 * (0.9 * curl / length)[:, None]
     parts[0][..., 2] -= sag
     return parts
+
+
+def _leaflet(number: int, leaflets: int) -> tuple[float, float, float]:
+    """Return a leaflet's place on the rachis, its size per leaf length and its angle.
+
+    Leaflets stand in pairs that grow and lean forward towards the tip; the last ends the leaf.
+    """
+    if number == leaflets - 1:
+        return 1.0, 0.4, 0.0
+    pair = number // 2
+    up = pair / max((leaflets - 1) // 2 - 1, 1)
+    side = 1 if number % 2 == 0 else -1
+    return 0.3 + 0.62 * up, 0.24 + 0.1 * up, side * float(np.radians(62 - 8 * pair))
 
 
 def _with_stalk(

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray, IntArray
-from mock_hw.orchard.tree import Tree
+from mock_hw.orchard.tree import Tree, TreeBranch
 
 Int32Array = NDArray[np.int32]
 UInt8Array = NDArray[np.uint8]
+_GOLDEN = 0.6180339887
 
 
 class Kind(IntEnum):
@@ -69,23 +70,19 @@ def mesh_of_wood(tree: Tree) -> Mesh:
 
     Rings lie half-way between vertices; a tube's width is that of a circle of the true radius.
     """
-    return merged([_branch_tube(tree, branch.vertices) for branch in tree.branches])
+    return merged([_branch_tube(tree, branch) for branch in tree.branches])
 
 
-def _branch_tube(tree: Tree, vertices: IntArray) -> Mesh:
+def _branch_tube(tree: Tree, branch: TreeBranch) -> Mesh:
+    vertices = branch.vertices
     position, radius = tree.position[vertices], tree.radius_m[vertices].copy()
-    if tree.parent[vertices[0]] >= 0 or vertices[0] != 0:
+    if branch.parent is not None:
         radius[0] = radius[1]
     middle = 0.5 * (position[1:] + position[:-1])
     line = np.concatenate([position[:1], middle, position[-1:]])
     width = np.concatenate([radius[:1], 0.5 * (radius[1:] + radius[:-1]), radius[-1:]])
-    return tube(
-        line, width, vertices.astype(np.int32), Kind.WOOD, tone=_branch_tone(int(vertices[-1]))
-    )
-
-
-def _branch_tone(vertex: int) -> float:
-    return float((vertex * 0.6180339887) % 1.0)
+    tone = (branch.id * _GOLDEN) % 1.0
+    return tube(line, width, vertices.astype(np.int32), Kind.WOOD, tone=tone)
 
 
 def tube(
@@ -105,14 +102,13 @@ def tube(
     texture[..., 0] = radius_m[:, None] * np.cos(turn)
     texture[..., 1] = radius_m[:, None] * np.sin(turn)
     texture[..., 2] = along[:, None]
-    anchor = np.concatenate([label[:1], np.maximum(label[1:], label[:-1]), label[-1:]])
     bands = _bands(n, sides)
     faces = np.repeat(label, 2 * sides)
     return Mesh(
         points=np.concatenate([rings.reshape(-1, 3), tip[None]]),
         normals=np.concatenate([spokes.reshape(-1, 3), axis[-1:]]).astype(np.float32),
         texture=np.concatenate([texture.reshape(-1, 3), texture[-1, :1]]),
-        anchor=np.concatenate([np.repeat(anchor, sides), label[-1:]]).astype(np.int32),
+        anchor=np.append(np.repeat(np.append(label, label[-1]), sides), label[-1]).astype(np.int32),
         triangles=bands,
         kind=np.full(len(bands), kind, dtype=np.uint8),
         vertex=np.concatenate([faces, np.full(sides, label[-1])]).astype(np.int32),

@@ -16,7 +16,7 @@ from mock_hw.orchard.surroundings import mesh_of_rows, mesh_of_trellis
 from mock_hw.orchard.tree import GROUND_Z_M, TRUNK_X_M, Tree
 
 _SUN_MAP_PX = 1536
-_SUN_MAP_M = 2.6
+_SHADOW_MAP_M = 2.6
 _ZENITH_MAP_PX = 320
 _ROW_LEAVES = {"apple": (300, 1400), "oak": (150, 1500), "walnut": (100, 260)}
 
@@ -49,7 +49,7 @@ class Scene:
 
 
 def fixtures(tree: Tree, seed: int, *, trellis: bool) -> list[Mesh]:
-    """Return what hides wood beside the leaves: wood (first), fruit, posts and wires."""
+    """Return what hides wood beside the leaves: wood, fruit, posts and wires."""
     rng = np.random.default_rng([seed, 3])
     parts = [mesh_of_wood(tree)]
     fruit = mesh_of_fruit(tree)
@@ -108,7 +108,7 @@ def _shadow_map(mesh: Mesh, towards_light: FloatArray, size_px: int) -> ShadowMa
         right = np.cross([0.0, 0.0, 1.0], towards_light)
         right /= np.linalg.norm(right)
         down = np.cross(right, towards_light)
-    scale = size_px / _SUN_MAP_M
+    scale = size_px / _SHADOW_MAP_M
     axes = np.stack([right * scale, down * scale, towards_light])
     offset = np.array([size_px / 2, size_px / 2, 10.0]) - axes @ centre
     map_from_base = np.concatenate([axes, offset[:, None]], axis=1)

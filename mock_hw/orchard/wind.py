@@ -29,16 +29,17 @@ def swayed(mesh: Mesh, tree: Tree, reach_m: float, rng: np.random.Generator) -> 
     gust = np.append(rng.standard_normal(2), 0.2 * rng.standard_normal())
     own = rng.standard_normal((len(tree.branches), 3)) * [0.4, 0.4, 0.3]
     give = compliance(tree)
-    shift = reach_m * give[:, None] * gust
+    swing = np.zeros_like(tree.position)
     for branch in tree.branches[1:]:
         inside, foot = branch.vertices[1:], branch.vertices[0]
-        shift[inside] += reach_m * (give[inside] - give[foot])[:, None] * own[branch.id]
+        swing[inside] = swing[foot] + (give[inside] - give[foot])[:, None] * own[branch.id]
+    shift = reach_m * (give[:, None] * gust + swing)
     held = mesh.anchor >= 0
     moved = mesh.points.copy()
     moved[held] += shift[mesh.anchor[held]]
     flutter = np.zeros(len(moved), dtype=bool)
     flutter[mesh.triangles[mesh.kind == Kind.LEAF].ravel()] = True
     blade = np.linalg.norm(mesh.points - tree.position[mesh.anchor], axis=1)
-    beat = np.sin(np.arange(len(moved)) // 64 * 1.7 + rng.uniform(0, 6.28))
+    beat = np.sin(1.7 * mesh.anchor + rng.uniform(0, 2 * np.pi))
     moved[flutter, 2] += (0.25 * reach_m * beat * np.minimum(blade / 0.08, 1.5))[flutter]
     return replace(mesh, points=moved)

@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mock_hw.orchard.kernels import texture
+from mock_hw.orchard.mesh import Kind
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -14,8 +15,9 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 Vec = tuple[float, float, float]
 
-# Kinds as in `mesh.Kind`; the ground has no triangles.
-_GROUND, _WOOD, _LEAF, _FRUIT, _POST, _WIRE, _FAR_WOOD, _FAR_LEAF = 1, 2, 3, 4, 5, 6, 7, 8
+_GROUND, _WOOD, _LEAF, _FRUIT = int(Kind.GROUND), int(Kind.WOOD), int(Kind.LEAF), int(Kind.FRUIT)
+_POST, _FAR_WOOD, _FAR_LEAF = int(Kind.POST), int(Kind.FAR_WOOD), int(Kind.FAR_LEAF)
+_WIRE = int(Kind.WIRE)
 _GROUND_ENDS_M = 26.0
 
 

@@ -153,6 +153,15 @@ def test_wind_moves_tips_and_neither_the_foot_nor_the_labels(simulation, rng):
     assert moved.vertex is scene.mesh.vertex
 
 
+@pytest.mark.parametrize("kind", [Kind.WOOD, Kind.LEAF])
+def test_wind_tears_nothing(simulation, rng, kind):
+    mesh = simulation.scene.mesh
+    moved = swayed(mesh, simulation.scene.tree, 0.02, rng)
+    edges = mesh.triangles[mesh.kind == kind][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    before, after = (np.diff(m.points[edges], axis=1)[:, 0] for m in (mesh, moved))
+    assert np.linalg.norm(after - before, axis=1).max() < 0.012
+
+
 def test_a_windy_scan_is_repeatable_and_differs_from_view_to_view(options):
     windy = replace(options, wind_m=0.02, camera=replace(options.camera, pair=False))
     first, second = (list(views(prepare(windy)))[:2] for _ in range(2))
