@@ -20,6 +20,7 @@ TOP_Z_M = 0.87
 CLEARANCE_M = 0.42
 HEDGE_M = 0.75
 _SHORTEST = 6
+_LIFT = 4.0
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -150,7 +151,7 @@ def _centreline(growth: Growth, bud: _Bud, rng: np.random.Generator) -> FloatArr
     for step in range(steps):
         pull = growth.rise * UP + growth.hold * bud.heading
         if point[2] < GROUND_Z_M + CLEARANCE_M and bud.parent is not None:
-            pull = pull + 4.0 * UP
+            pull = pull + _LIFT * UP
         heading = heading + SPACING_M * (pull - (pull @ heading) * heading)
         heading = heading + kinks[step] - (kinks[step] @ heading) * heading
         heading = heading / np.linalg.norm(heading)
