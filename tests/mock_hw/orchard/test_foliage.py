@@ -24,8 +24,9 @@ def test_one_pass_over_the_leaves_sees_what_a_rendering_of_any_canopy_sees(canop
     count = 400
     scene = build_scene(apple, count, fair_weather(), seed=0, rows=False, trellis=True)
     found = np.zeros(len(apple.position), dtype=bool)
-    for pose in POSES:
+    for pose, vertex, cover in zip(POSES, canopy.vertex, canopy.cover, strict=True):
         picture = renderer.draw(scene.mesh, pose, OAK_D)
+        assert np.array_equal(np.where(cover >= count, vertex, -1), picture.vertex)
         fragments = fragments_of(picture.vertex, apple, scene.piece, pose, OAK_D)
         found[fragments.vertex[fragments.detectable[fragments.fragment]]] = True
     assert np.array_equal(canopy.detected(count), found)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -122,6 +124,20 @@ def test_shadow_and_weather_change_the_picture_but_not_depth(apple, small):
     assert np.abs(bright - dull).mean() > 0.02
     assert np.isfinite(bright).all()
     assert np.isfinite(dull).all()
+
+
+def test_trees_cast_shadows(apple, small):
+    scene = build_scene(apple, 900, fair_weather(), seed=0, rows=False, trellis=False)
+    no_shadow = replace(scene.sun_map, w=np.zeros_like(scene.sun_map.w))
+    picture = renderer.draw(scene.mesh, POSE, small)
+    dark, bright = (
+        renderer.radiance(each, picture, POSE, small)[..., 1]
+        for each in (scene, replace(scene, sun_map=no_shadow))
+    )
+    tree = np.isin(picture.kind, [Kind.WOOD, Kind.LEAF])
+    assert (dark <= bright + 1e-6).all()
+    assert (dark[tree] < 0.8 * bright[tree]).mean() > 0.1
+    assert (dark[tree] > 0.99 * bright[tree]).mean() > 0.1, "no surface shadows itself"
 
 
 def test_points_behind_the_camera_do_no_harm(apple_scene, small):

@@ -75,6 +75,22 @@ def test_depth_of_wood_is_near_the_truth(simulation, run, small):
     assert 0.3 * expected < np.median(error) < 1.5 * expected
 
 
+def test_the_right_eye_sees_wood_shifted_by_its_disparity(simulation, run, small):
+    differences = {1: [], -1: []}
+    for view, pose in zip(run, simulation.true_poses, strict=True):
+        picture = renderer.draw(simulation.scene.mesh, pose, small)
+        v, u = np.nonzero(picture.kind == Kind.WOOD)
+        disparity = small.fx_px * view.stereo.baseline_m / picture.depth_m[v, u]
+        for sign, found in differences.items():
+            column = np.rint(u - sign * disparity).astype(int)
+            inside = (column >= 0) & (column < small.width_px)
+            left = view.stereo.left_mono[v, u].astype(int)[inside]
+            found.append(np.abs(left - view.stereo.right_mono[v[inside], column[inside]]))
+    right, wrong = (np.concatenate(differences[sign]).mean() for sign in (1, -1))
+    assert right < 20
+    assert right < 0.6 * wrong
+
+
 def test_reported_poses_carry_one_hand_eye_error_and_a_small_one_per_view(simulation):
     hand_eye = invert(TOOL_FROM_CAMERA) @ simulation.tool_from_camera
     assert 0 < np.linalg.norm(hand_eye[:3, 3]) < 0.005
@@ -82,6 +98,10 @@ def test_reported_poses_carry_one_hand_eye_error_and_a_small_one_per_view(simula
         tool = reported @ invert(simulation.tool_from_camera)
         drift = np.linalg.norm((tool - true @ invert(TOOL_FROM_CAMERA))[:3, 3])
         assert 0 < drift < 0.0015
+    both = zip(simulation.reported_poses, simulation.true_poses, strict=True)
+    error = np.mean([(invert(true) @ reported)[:3, 3] for reported, true in both], axis=0)
+    assert error == pytest.approx(hand_eye[:3, 3], abs=0.0003)
+    assert np.linalg.norm(hand_eye[:3, 3]) > 0.0007
 
 
 def test_without_noise_the_reported_poses_are_the_true_ones(options):
