@@ -76,7 +76,7 @@ def sheet_of_profiles(species: Species, topologies: range) -> UInt8Array:
     """Return a sheet: topologies across; leafless, thin and full crowns down, seen from afar."""
     tall = Intrinsics(fx_px=700, fy_px=700, cx_px=240, cy_px=300, width_px=480, height_px=600)
     camera = Camera(intrinsics=tall, noise=None)
-    pose = look_at([TRUNK_X_M - 2.6, 0.0, 0.15], [TRUNK_X_M, 0.0, -0.02])
+    pose = look_at([TRUNK_X_M - 3.1, 0.0, 0.15], [TRUNK_X_M, 0.0, -0.02])
     columns = []
     for topology in topologies:
         tree = grow(species, topology)
