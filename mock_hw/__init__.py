@@ -1,0 +1,1 @@
+"""Stand-ins for hardware that answer like the real thing. Shipped: simulation is a product."""
