@@ -142,7 +142,8 @@ def _tool_points(joints_rad: FloatArray, points_in_tool0: FloatArray) -> FloatAr
     points = np.vstack([np.zeros((1, 3)), points_in_tool0])
     poses = np.array([kinematics.forward(joints) for joints in joints_rad])
     turned: FloatArray = np.einsum("nij,kj->nki", poses[:, :3, :3], points)
-    return turned + poses[:, None, :3, 3]
+    shifted: FloatArray = turned + poses[:, None, :3, 3]
+    return shifted
 
 
 def _check_box(points_in_base: FloatArray, limits: Limits) -> None:

@@ -2,12 +2,28 @@
 
 import json
 import os
+import random
 import signal
 import socket
 import subprocess
 import sys
 from types import TracebackType
 from typing import Any, Self
+
+from mock_hw.fake_ur import dashboard
+
+
+def free_host() -> str:
+    """Return a loopback address on which no controller listens yet."""
+    for number in random.sample(range(2, 255), 253):
+        host = f"127.0.0.{number}"
+        with socket.socket() as probe:
+            try:
+                probe.bind((host, dashboard.PORT))
+            except OSError:
+                continue
+        return host
+    raise RuntimeError("every loopback address 127.0.0.N has a controller already; end some")
 
 
 class FakeUr:

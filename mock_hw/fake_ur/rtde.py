@@ -93,7 +93,9 @@ class RtdeServer:
             if not client.started or now_s + 1e-9 < client.next_due_s:
                 continue
             period_s = max(client.output_period_s, self._network.slow_period_s)
-            client.next_due_s = max(client.next_due_s + period_s, now_s)
+            client.next_due_s += period_s
+            if client.next_due_s <= now_s:
+                client.next_due_s = now_s + period_s
             if client.writer.transport.get_write_buffer_size() < _BACKLOG_BYTES:
                 client.send(_DATA, self._data(client))
 
