@@ -2,15 +2,19 @@
 
 Nominal kinematics only: every real arm differs from them by its factory calibration (about a
 millimetre), so poses that are recorded come from the controller and these functions plan.
-Denavit-Hartenberg values: UR5 user manual, series 3. Closed-form inverse: `ur-analytic-ik`.
+Denavit-Hartenberg values: UR5 user manual, series 3.
+
+The closed form rests on the shape of the arm: joints 2, 3 and 4 are parallel, so wrist 1 lies in
+a plane that turns with the base, and the way there is a planar arm of two links. (`ur-analytic-ik`
+does the same, but loses all solutions in postures of exact right angles, the usual home pose.)
 """
 
 import math
 from collections.abc import Iterable, Sequence
+from math import atan2, cos, sin
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from ur_analytic_ik import ur5
 
 from canopy_skel.geometry import FloatArray, transform_from
 
@@ -21,11 +25,25 @@ _D_M = (0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823)
 _A_M = (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0)
 _ALPHA_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 _LARGEST_STEP_RAD = 0.6
+_STRAIGHT = 1e-9
 
 
 def forward(joints_rad: Sequence[float] | FloatArray) -> FloatArray:
     """Return base_from_tool0, the (4, 4) pose of the tool flange for six joint angles."""
-    pose: FloatArray = ur5.forward_kinematics(*map(float, joints_rad))
+    q1, q2, q3, q4, q5, q6 = map(float, joints_rad)
+    c1, s1, c5, s5, c6, s6 = cos(q1), sin(q1), cos(q5), sin(q5), cos(q6), sin(q6)
+    c234, s234 = cos(q2 + q3 + q4), sin(q2 + q3 + q4)
+    out_m = _A_M[1] * cos(q2) + _A_M[2] * cos(q2 + q3)
+    up_m = _A_M[1] * sin(q2) + _A_M[2] * sin(q2 + q3) + _D_M[0]
+    x4 = (c234 * c1, c234 * s1, s234)
+    y4 = (s1, -c1, 0.0)
+    z4 = (s234 * c1, s234 * s1, -c234)
+    wrist = (out_m * c1 + _D_M[3] * s1, out_m * s1 - _D_M[3] * c1, up_m)
+    pose = np.eye(4)
+    for i in range(3):
+        x5, y5, z5 = c5 * x4[i] + s5 * y4[i], -z4[i], c5 * y4[i] - s5 * x4[i]
+        pose[i, 0], pose[i, 1], pose[i, 2] = c6 * x5 + s6 * y5, c6 * y5 - s6 * x5, z5
+        pose[i, 3] = wrist[i] + _D_M[4] * z4[i] + _D_M[5] * z5
     return pose
 
 
@@ -37,11 +55,11 @@ def joint_origins(joints_rad: FloatArray) -> FloatArray:
     base_from_link = np.broadcast_to(np.eye(4), (len(joints_rad), 4, 4))
     origins = np.empty((len(joints_rad), 6, 3))
     for joint, (d_m, a_m, alpha_rad) in enumerate(zip(_D_M, _A_M, _ALPHA_RAD, strict=True)):
-        cos, sin = np.cos(joints_rad[:, joint]), np.sin(joints_rad[:, joint])
-        ca, sa = math.cos(alpha_rad), math.sin(alpha_rad)
+        c, s = np.cos(joints_rad[:, joint]), np.sin(joints_rad[:, joint])
+        ca, sa = cos(alpha_rad), sin(alpha_rad)
         step = np.zeros((len(joints_rad), 4, 4))
-        step[:, 0] = np.stack([cos, -sin * ca, sin * sa, a_m * cos], axis=-1)
-        step[:, 1] = np.stack([sin, cos * ca, -cos * sa, a_m * sin], axis=-1)
+        step[:, 0] = np.stack([c, -s * ca, s * sa, a_m * c], axis=-1)
+        step[:, 1] = np.stack([s, c * ca, -c * sa, a_m * s], axis=-1)
         step[:, 2] = (0.0, sa, ca, d_m)
         step[:, 3, 3] = 1.0
         base_from_link = base_from_link @ step
@@ -54,19 +72,60 @@ def inverse(
 ) -> FloatArray | None:
     """Return the joints (6,) that reach a pose with the least turning from `near_joints_rad`.
 
-    Whole turns are chosen per joint within ±360°. None: no solution within reach.
+    Whole turns are chosen per joint within ±360°. Where the wrist is straight (joints 4 and 6
+    parallel) joint 6 stays as it is. None: no solution within reach.
     """
-    solutions = ur5.inverse_kinematics(np.ascontiguousarray(base_from_tool0))
+    near = np.asarray(near_joints_rad, dtype=np.float64)
+    solutions = _solutions(base_from_tool0.tolist(), float(near[5]))
     if not solutions:
         return None
-    near = np.asarray(near_joints_rad, dtype=np.float64)
     joints = np.asarray(solutions)
-    joints = joints + 2 * math.pi * np.round((near - joints) / (2 * math.pi))
+    joints = joints + math.tau * np.round((near - joints) / math.tau)
     joints = np.where(
         np.abs(joints) <= JOINT_LIMIT_RAD, joints, joints - np.sign(joints) * math.tau
     )
     best: FloatArray = joints[np.argmin(np.abs(joints - near).max(axis=1))]
     return best
+
+
+def _solutions(pose: list[list[float]], near_q6: float) -> list[tuple[float, ...]]:
+    """Return all joints that reach a pose, up to two each for shoulder, wrist and elbow."""
+    (x6, y6, z6, p6) = (tuple(row[column] for row in pose[:3]) for column in range(4))
+    p5 = tuple(p6[i] - _D_M[5] * z6[i] for i in range(3))
+    radius_m = math.hypot(p5[0], p5[1])
+    if radius_m < _D_M[3]:
+        return []
+    found: list[tuple[float, ...]] = []
+    for shoulder in (1, -1):
+        q1 = atan2(p5[1], p5[0]) + shoulder * math.acos(_D_M[3] / radius_m) + math.pi / 2
+        c1, s1 = cos(q1), sin(q1)
+        along_x, along_y = x6[0] * s1 - x6[1] * c1, y6[0] * s1 - y6[1] * c1
+        bend = math.hypot(along_x, along_y)
+        for wrist in (1, -1):
+            q5 = atan2(wrist * bend, z6[0] * s1 - z6[1] * c1)
+            straight = bend < _STRAIGHT
+            q6 = near_q6 if straight else atan2(-wrist * along_y, wrist * along_x)
+            c5, s5, c6, s6 = cos(q5), sin(q5), cos(q6), sin(q6)
+            y5 = tuple(s6 * x6[i] + c6 * y6[i] for i in range(3))
+            x4 = tuple(c5 * (c6 * x6[i] - s6 * y6[i]) - s5 * z6[i] for i in range(3))
+            p4 = tuple(p5[i] + _D_M[4] * y5[i] for i in range(3))
+            q234 = atan2(x4[2], x4[0] * c1 + x4[1] * s1)
+            for q2, q3 in _elbows(p4[0] * c1 + p4[1] * s1, p4[2] - _D_M[0]):
+                found.append((q1, q2, q3, q234 - q2 - q3, q5, q6))
+    return found
+
+
+def _elbows(out_m: float, up_m: float) -> list[tuple[float, float]]:
+    """Return joints 2 and 3 that bring the end of the forearm to a point of the arm's plane."""
+    upper, fore = _A_M[1], _A_M[2]
+    bend = (out_m * out_m + up_m * up_m - upper * upper - fore * fore) / (2 * upper * fore)
+    if abs(bend) > 1.0 + _STRAIGHT:
+        return []
+    bent_rad = math.acos(max(-1.0, min(1.0, bend)))
+    return [
+        (atan2(up_m, out_m) - atan2(fore * sin(q3), upper + fore * cos(q3)), q3)
+        for q3 in (bent_rad, -bent_rad)
+    ]
 
 
 def within_limits(joints_rad: Iterable[float]) -> bool:

@@ -1,6 +1,7 @@
 """The state of the fake controller and what one control cycle does to it."""
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Protocol
@@ -13,7 +14,7 @@ from mock_hw.fake_ur.motion import JOINT_SPEED_LIMIT_RPS, JointWay, LineWay, Mot
 
 log = logging.getLogger(__name__)
 
-HOME_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+HOME_RAD = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
 REGISTERS = 48
 _QUICK_STOP = {JointWay: 12.0, LineWay: 6.0}
 _UNLOCK_DELAY_S = 5.0
@@ -252,6 +253,12 @@ class Controller:
         self.power_on()
         if self.robot_mode in (RobotMode.BOOTING, RobotMode.IDLE):
             self._in(2 * _BOOT_S, lambda: self._set_mode(RobotMode.RUNNING))
+
+    def place_at_home(self) -> None:
+        """Put the arm into its first posture, without moving there."""
+        self.motion = None
+        self.joints = np.array(HOME_RAD)
+        self.set_tcp((0.0,) * 6)
 
     def restore(self) -> None:
         """Bring arm and safety back to normal at once; the pose stays, no program runs."""

@@ -31,9 +31,12 @@ class FaultServer:
             "freeze": network.freeze,
             "thaw": network.thaw,
             "cut_link": network.cut,
+            "mend_link": network.mend,
             "slow_packets": self._slow,
             "refuse_scripts": self._refuse,
             "local_control": self._local_control,
+            "home": controller.place_at_home,
+            "set_tcp": lambda x, y, z: controller.set_tcp((x, y, z, 0.0, 0.0, 0.0)),
             "reset": self._reset,
         }
 

@@ -12,8 +12,9 @@ import rtde_io
 import rtde_receive
 
 from drivers import kinematics
+from mock_hw.fake_ur.controller import HOME_RAD
 
-HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
+HOME = list(HOME_RAD)
 TICK_S = 0.03
 """Long enough for two packages on every connection."""
 
