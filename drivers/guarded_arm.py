@@ -12,7 +12,7 @@ import numpy as np
 
 from canopy_skel.geometry import FloatArray
 from drivers import kinematics
-from drivers.errors import SpeedCapError, UnreachableError, WorkspaceError
+from drivers.errors import SpeedCapError, WorkspaceError
 from drivers.protocols import Arm, ArmState, LinearMove, Move
 
 
@@ -128,13 +128,10 @@ def _cap(name: str, asked: float, allowed: float, unit: str) -> None:
 def _way(move: Move, state: ArmState) -> FloatArray:
     """Return joints (N, 6) along the move."""
     if not isinstance(move, LinearMove):
-        return kinematics.turned_joints(state.joints_rad, np.asarray(move.joints_rad, dtype=float))
-    joints = kinematics.straight_joints(
+        return kinematics.turned_joints(state.joints_rad, move.joints_rad)
+    return kinematics.straight_joints(
         state.pose.base_from_tool0, move.base_from_tool0, state.joints_rad
     )
-    if joints is None:
-        raise UnreachableError("the arm cannot follow the straight line to the target")
-    return joints
 
 
 def _tool_points(joints_rad: FloatArray, points_in_tool0: FloatArray) -> FloatArray:

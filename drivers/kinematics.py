@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from canopy_skel.geometry import FloatArray, transform_from
+from drivers.errors import UnreachableError
 
 JOINT_LIMIT_RAD = 2 * math.pi
 """A UR5 joint turns at most one full turn to each side."""
@@ -138,12 +139,17 @@ def straight_joints(
     base_from_end: FloatArray,
     near_joints_rad: FloatArray,
     step_m: float = 0.02,
-) -> FloatArray | None:
+) -> FloatArray:
     """Return joints (N, 6) along the straight line between two tool0 poses, both ends included.
 
-    None where the line leaves the reach of the arm, or passes so close to a singularity that a
-    joint would turn more than 0.6 rad within one step.
+    Raises:
+        UnreachableError: the end is out of reach, or the line leaves the reach or passes so close
+            to a singularity, or to ±360° of a joint, that one would turn more than 0.6 rad
+            within one step.
     """
+    goal = "({:.3f}, {:.3f}, {:.3f}) m".format(*base_from_end[:3, 3])
+    if inverse(base_from_end, near_joints_rad) is None:
+        raise UnreachableError(f"no joints bring the tool to {goal}")
     length_m = float(np.linalg.norm(base_from_end[:3, 3] - base_from_start[:3, 3]))
     turn_rad = float(np.linalg.norm(rotation_vector(relative_turn(base_from_start, base_from_end))))
     steps = max(2, math.ceil(length_m / step_m), math.ceil(turn_rad / 0.1))
@@ -151,7 +157,10 @@ def straight_joints(
     for fraction in np.linspace(0.0, 1.0, steps + 1):
         joints = inverse(interpolate(base_from_start, base_from_end, float(fraction)), path[-1])
         if joints is None or np.abs(joints - path[-1]).max() > _LARGEST_STEP_RAD:
-            return None
+            raise UnreachableError(
+                f"the straight line to {goal} leaves the reach of the arm, passes a singularity or"
+                " would turn a joint beyond ±360°: make a joint move or go over another waypoint"
+            )
         path.append(joints)
     return np.asarray(path[1:])
 

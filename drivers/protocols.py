@@ -1,5 +1,6 @@
 """What an arm and a camera are to the rest of the program, whatever stands behind them."""
 
+import math
 import time
 from dataclasses import dataclass
 from enum import Enum
@@ -9,11 +10,12 @@ from typing import Protocol, Self
 import numpy as np
 
 from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array
-from canopy_skel.geometry import FloatArray
+from canopy_skel.geometry import FloatArray, is_rigid
 from drivers.errors import (
     ArmError,
     EmergencyStopError,
     MoveInterruptedError,
+    MoveRefusedError,
     NotAcknowledgedError,
     NotPoweredError,
     ProtectiveStopError,
@@ -78,20 +80,42 @@ class ArmState:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class LinearMove:
-    """Move the flange straight to a (4, 4) pose, turning evenly on the way."""
+    """Move the flange straight to a (4, 4) pose, turning evenly on the way.
+
+    Raises:
+        MoveRefusedError: the numbers make no move.
+    """
 
     base_from_tool0: FloatArray
     speed_mps: float
     acceleration_mps2: float
 
+    def __post_init__(self) -> None:
+        """Check the numbers once; trusted afterwards."""
+        if not is_rigid(self.base_from_tool0):
+            raise MoveRefusedError(
+                "base_from_tool0 is not a rigid (4, 4) transform: check the plan"
+            )
+        _check_positive(speed=self.speed_mps, acceleration=self.acceleration_mps2)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class JointMove:
-    """Turn all joints in proportion to (6,) angles; speeds are those of the leading joint."""
+    """Turn all joints in proportion to (6,) angles; speeds are those of the leading joint.
+
+    Raises:
+        MoveRefusedError: the numbers make no move.
+    """
 
     joints_rad: FloatArray
     speed_rps: float
     acceleration_rps2: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers once; trusted afterwards."""
+        if self.joints_rad.shape != (6,) or not np.isfinite(self.joints_rad).all():
+            raise MoveRefusedError("joints_rad are not six finite angles: check the plan")
+        _check_positive(speed=self.speed_rps, acceleration=self.acceleration_rps2)
 
 
 Move = LinearMove | JointMove
@@ -226,6 +250,12 @@ def raise_unless_movable(state: ArmState, also: tuple[ArmMode, ...] = ()) -> Non
     """Raise the error that belongs to the mode, unless it is READY or one of `also`."""
     if state.mode is not ArmMode.READY and state.mode not in also:
         raise _ERRORS[state.mode](state.detail or state.mode.value)
+
+
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not (math.isfinite(value) and value > 0):
+            raise MoveRefusedError(f"{name} is {value}; it must be finite and above 0")
 
 
 def _is_still(state: ArmState, still: Stillness) -> bool:

@@ -112,7 +112,7 @@ class Ur5Arm:
             raise ArmBusyError("a move is under way: wait for its end or stop it")
         raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
         request = request_for(move, state)
-        self._prepare()
+        self._prepare(self._fresh()[0])
         with self._sending:
             if self._stops != stops:
                 raise MoveInterruptedError("stopped on request before the move began")
@@ -184,22 +184,28 @@ class Ur5Arm:
             raise NotConnectedError("the arm is not connected: use it inside its `with` block")
         return self._link
 
-    def _prepare(self) -> None:
+    def _prepare(self, sample: Sample) -> None:
+        """Have the control script run; uploading it takes a robot in remote control."""
+        if not sample.tcp_is_flange and self._in_local_control():
+            raise NotInRemoteControlError("switch the controller to remote control")
         reply = self._connected().post(Prepare()).wait(self._config.connect_timeout_s)
         if reply is None:
             raise self._give_up("did not get the control script to run")
         if reply.refusal:
             raise self._why_refused(reply.refusal)
 
+    def _in_local_control(self) -> bool:
+        """Ask the dashboard; controllers before 5.6 do not know the question."""
+        try:
+            return self._dashboard.ask("is in remote control") == "false"
+        except OSError as error:
+            raise NotConnectedError(f"{self._config.host} does not answer: {error}") from error
+
     def _why_refused(self, refusal: str) -> ArmError:
         try:
-            if self._dashboard.ask("is in remote control") == "false":
-                return NotInRemoteControlError("switch the controller to remote control")
             raise_unless_movable(self.state(), also=(ArmMode.INTERRUPTED,))
         except ArmError as error:
             return error
-        except OSError as error:
-            return NotConnectedError(f"{self._config.host} does not answer: {error}")
         return MoveRefusedError(f"{refusal}; see the log of the controller")
 
     def _give_up(self, what: str) -> ArmError:

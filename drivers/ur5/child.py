@@ -45,7 +45,6 @@ _FREQUENCY_HZ = 125.0
 _UPKEEP_S = 0.01
 _WATCH_S = 0.002
 _BEAT_S = 0.05
-_SCRIPT_START_S = 5.0
 _VARIABLES = [
     "timestamp",
     "actual_q",
@@ -219,7 +218,7 @@ class Mover:
             self._control.reuploadScript()
         except RuntimeError as error:
             return f"the controller did not take the control script ({error})"
-        until_s = time.monotonic() + _SCRIPT_START_S
+        until_s = time.monotonic() + self._config.script_timeout_s
         while not self._control.isProgramRunning():
             if time.monotonic() > until_s:
                 return "the controller did not start the control script"

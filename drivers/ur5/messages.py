@@ -41,6 +41,7 @@ class Ur5Config:
     connect_timeout_s: float = 10.0
     command_timeout_s: float = 3.0
     stop_timeout_s: float = 0.5
+    script_timeout_s: float = 5.0
     power_timeout_s: float = 40.0
     stop_deceleration_mps2: float = 1.0
     stop_deceleration_rps2: float = 2.0

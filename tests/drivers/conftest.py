@@ -7,9 +7,9 @@ from drivers.ur5.messages import Ur5Config
 from mock_hw.fake_ur.process import FakeUr, free_host
 
 
-@pytest.fixture(scope="module", params=["3.15", "5.15"])
-def version(request):
-    return request.param
+@pytest.fixture(scope="module")
+def version():
+    return "3.15"
 
 
 @pytest.fixture(scope="module")
@@ -29,4 +29,4 @@ def fake(shared_fake):
 
 @pytest.fixture
 def make_arm(fake):
-    return lambda: Ur5Arm(Ur5Config(host=fake.host, payload_kg=0.6))
+    return lambda: Ur5Arm(Ur5Config(host=fake.host, payload_kg=0.6, script_timeout_s=0.5))
