@@ -14,9 +14,8 @@ from collections.abc import Iterable, Sequence
 from math import atan2, cos, sin
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from canopy_skel.geometry import FloatArray, transform_from
+from canopy_skel.geometry import FloatArray, rotation_from_quaternion, transform_from
 from drivers.errors import UnreachableError
 
 JOINT_LIMIT_RAD = 2 * math.pi
@@ -188,13 +187,30 @@ def relative_turn(base_from_a: FloatArray, base_from_b: FloatArray) -> FloatArra
 
 
 def rotation_vector(rotation: FloatArray) -> FloatArray:
-    """Return the axis of a (3, 3) rotation times its angle in radians, (3,)."""
-    return Rotation.from_matrix(rotation, assume_valid=True).as_rotvec()
+    """Return the axis of a (3, 3) rotation times its angle in radians, (3,).
+
+    Through the quaternion whose largest part is found first (Shepperd 1978), so that half turns,
+    a tool pointing straight down for one, are as exact as any other.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    quaternion = max(
+        (1 + a - e - i, (1 + a - e - i, b + d, c + g, h - f)),
+        (1 - a + e - i, (b + d, 1 - a + e - i, f + h, c - g)),
+        (1 - a - e + i, (c + g, f + h, 1 - a - e + i, d - b)),
+        (1 + a + e + i, (h - f, c - g, d - b, 1 + a + e + i)),
+    )[1]
+    x, y, z, w = quaternion if quaternion[3] >= 0 else (-part for part in quaternion)
+    length = math.hypot(x, y, z)
+    scale = 2 * atan2(length, w) / length if length > 0 else 0.0
+    return np.array([scale * x, scale * y, scale * z])
 
 
 def rotation_from_vector(vector_rad: FloatArray) -> FloatArray:
     """Return the (3, 3) rotation about the direction of a (3,) vector by its length in radians."""
-    return Rotation.from_rotvec(vector_rad).as_matrix()
+    x, y, z = vector_rad.tolist()
+    angle_rad = math.hypot(x, y, z)
+    scale = sin(angle_rad / 2) / angle_rad if angle_rad > 0 else 0.0
+    return rotation_from_quaternion((scale * x, scale * y, scale * z, cos(angle_rad / 2)))
 
 
 def pose_from_transform(transform: FloatArray) -> tuple[float, ...]:

@@ -13,18 +13,22 @@ import rtde_receive
 
 from drivers import kinematics
 from mock_hw.fake_ur.controller import HOME_RAD
+from mock_hw.fake_ur.process import FakeUr
 
 HOME = list(HOME_RAD)
-TICK_S = 0.03
-"""Long enough for two packages on every connection."""
 
 
 @dataclass
 class Client:
-    host: str
+    fake: FakeUr
     control: Any
     receive: Any
     io: Any
+
+    def catch_up(self):
+        """Wait for packages that are newer than what the controller does now."""
+        stamp_s = self.fake.do("state")["stamp_s"]
+        wait_until(lambda: self.receive.getTimestamp() > stamp_s)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +36,7 @@ def shared_client(shared_fake):
     host = shared_fake.host
     flags = rtde_control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT
     client = Client(
-        host=host,
+        fake=shared_fake,
         control=rtde_control.RTDEControlInterface(host, -1.0, flags),
         receive=rtde_receive.RTDEReceiveInterface(host),
         io=rtde_io.RTDEIOInterface(host),
@@ -52,7 +56,7 @@ def client(shared_client, fake):
     shared_client.io.setSpeedSlider(1.0)
     assert control.setTcp([0.0] * 6)
     assert control.moveJ(HOME, 3.0, 10.0)
-    time.sleep(TICK_S)
+    shared_client.catch_up()
     return shared_client
 
 
@@ -106,12 +110,12 @@ def test_it_takes_the_client_for_a_controller_of_its_generation(client, dashboar
 def test_blocking_moves_arrive(client):
     target = [q + d for q, d in zip(HOME, [0.4, 0.1, -0.2, 0.3, 0.2, -1.0], strict=True)]
     assert client.control.moveJ(target, 1.05, 1.4)
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getActualQ() == pytest.approx(target, abs=1e-9)
 
     pose = shifted(client, dx=0.05, dy=-0.03, dz=0.04)
     assert client.control.moveL(pose, 0.25, 0.5)
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getActualTCPPose()[:3] == pytest.approx(pose[:3], abs=1e-8)
     assert client.receive.getActualTCPSpeed() == [0.0] * 6
 
@@ -143,7 +147,7 @@ def test_a_path_reports_its_waypoints(client):
         if progress >= 0 and progress not in seen:
             seen.append(progress)
     assert seen == [0, 1, 2, 3]
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getActualTCPPose()[:3] == pytest.approx(b[:3], abs=1e-5)
 
 
@@ -153,7 +157,7 @@ def test_a_stopped_move_stays_stopped(client, stop):
     assert client.control.moveL(target, 0.05, 0.5, True)
     wait_until(lambda: abs(client.receive.getActualTCPSpeed()[2]) > 0.04)
     getattr(client.control, stop)(2.0)
-    time.sleep(TICK_S)
+    client.catch_up()
     rest = client.receive.getActualTCPPose()
     assert target[2] + 0.05 < rest[2]
     assert client.control.isSteady()
@@ -203,12 +207,12 @@ def test_the_tool_centre_point_and_the_payload_are_taken_over(client):
     flange = np.array(client.receive.getActualTCPPose()[:3])
     assert client.control.setTcp([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     assert client.control.getTCPOffset() == pytest.approx([0, 0, 0.1, 0, 0, 0], abs=1e-12)
-    time.sleep(TICK_S)
+    client.catch_up()
     tool = np.array(client.receive.getActualTCPPose()[:3])
     assert np.linalg.norm(tool - flange) == pytest.approx(0.1, abs=1e-9)
     pose = shifted(client, dz=-0.05)
     assert client.control.moveL(pose, 0.25, 0.5)
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getActualTCPPose()[:3] == pytest.approx(pose[:3], abs=1e-8)
 
     assert client.control.setPayload(1.2, [0.0, 0.01, 0.05])
@@ -237,7 +241,7 @@ def test_a_line_through_the_column_ends_in_a_protective_stop(client):
     mirrored[:2] = -mirrored[0], -mirrored[1]
     assert client.control.isPoseWithinSafetyLimits(mirrored)
     assert not client.control.moveL(mirrored, 0.25, 0.5)
-    assert client.receive.isProtectiveStopped()
+    wait_until(client.receive.isProtectiveStopped)
 
 
 def test_a_protective_stop_holds_until_unlocked_and_the_script_is_new(client, fake, dashboard):
@@ -261,7 +265,7 @@ def test_a_protective_stop_holds_until_unlocked_and_the_script_is_new(client, fa
     assert client.control.reuploadScript()
     wait_until(client.control.isProgramRunning)
     assert client.control.moveL(target, 0.25, 0.5)
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getActualTCPPose()[2] == pytest.approx(target[2], abs=1e-8)
 
 
@@ -283,7 +287,7 @@ def test_an_emergency_stop_takes_the_power(client, fake, dashboard):
     assert client.receive.getSafetyMode() == 7
     assert not client.control.moveJ(HOME, 1.0, 1.0)
     dashboard.powerOn()
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getRobotMode() == 3
 
     fake.do("release_emergency_stop")
@@ -305,7 +309,7 @@ def test_the_watchdog_ends_the_program_of_a_silent_client(client, fake):
         time.sleep(0.02)
     assert client.control.isProgramRunning()
     wait_until(lambda: not client.control.isProgramRunning())
-    time.sleep(TICK_S)
+    client.catch_up()
     state = fake.do("state")
     assert not state["moving"]
     assert state["tcp_pose"][2] > target[2] + 0.01
@@ -325,16 +329,18 @@ def test_straight_programs_run_and_others_are_refused(client):
     pose = shifted(client, dz=-0.02)
     script = f"movel(p{pose},a=0.5,v=0.25)\nsleep(0.1)"
     assert control.sendCustomScriptFunction("go", script)
-    time.sleep(TICK_S)
+    client.catch_up()
     assert client.receive.getActualTCPPose()[2] == pytest.approx(pose[2], abs=1e-8)
     wait_until(control.isProgramRunning)
 
 
 def test_registers_belong_to_one_client(client):
     with pytest.raises(RuntimeError, match="already in use"):
-        rtde_control.RTDEControlInterface(client.host)
+        rtde_control.RTDEControlInterface(client.fake.host)
 
 
 def test_unknown_variables_are_named(client):
     with pytest.raises(RuntimeError, match="actual_happiness"):
-        rtde_receive.RTDEReceiveInterface(client.host, 125.0, ["timestamp", "actual_happiness"])
+        rtde_receive.RTDEReceiveInterface(
+            client.fake.host, 125.0, ["timestamp", "actual_happiness"]
+        )
