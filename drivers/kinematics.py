@@ -75,17 +75,20 @@ def inverse(
     Whole turns are chosen per joint within ±360°. Where the wrist is straight (joints 4 and 6
     parallel) joint 6 stays as it is. None: no solution within reach.
     """
-    near = np.asarray(near_joints_rad, dtype=np.float64)
-    solutions = _solutions(base_from_tool0.tolist(), float(near[5]))
-    if not solutions:
-        return None
-    joints = np.asarray(solutions)
-    joints = joints + math.tau * np.round((near - joints) / math.tau)
-    joints = np.where(
-        np.abs(joints) <= JOINT_LIMIT_RAD, joints, joints - np.sign(joints) * math.tau
-    )
-    best: FloatArray = joints[np.argmin(np.abs(joints - near).max(axis=1))]
-    return best
+    near = [float(joint) for joint in near_joints_rad]
+    best, least_rad = None, math.inf
+    for solution in _solutions(base_from_tool0.tolist(), near[5]):
+        joints = [_wound(joint, beside) for joint, beside in zip(solution, near, strict=True)]
+        turn_rad = max(abs(joint - beside) for joint, beside in zip(joints, near, strict=True))
+        if turn_rad < least_rad:
+            best, least_rad = joints, turn_rad
+    return None if best is None else np.array(best)
+
+
+def _wound(joint_rad: float, near_rad: float) -> float:
+    """Return the angle plus those whole turns that bring it nearest within ±360°."""
+    wound = joint_rad + math.tau * round((near_rad - joint_rad) / math.tau)
+    return wound if abs(wound) <= JOINT_LIMIT_RAD else wound - math.copysign(math.tau, wound)
 
 
 def _solutions(pose: list[list[float]], near_q6: float) -> list[tuple[float, ...]]:
@@ -93,11 +96,12 @@ def _solutions(pose: list[list[float]], near_q6: float) -> list[tuple[float, ...
     (x6, y6, z6, p6) = (tuple(row[column] for row in pose[:3]) for column in range(4))
     p5 = tuple(p6[i] - _D_M[5] * z6[i] for i in range(3))
     radius_m = math.hypot(p5[0], p5[1])
-    if radius_m < _D_M[3]:
+    if radius_m < _D_M[3] - _STRAIGHT:
         return []
+    aside_rad = math.acos(min(1.0, _D_M[3] / radius_m))
     found: list[tuple[float, ...]] = []
     for shoulder in (1, -1):
-        q1 = atan2(p5[1], p5[0]) + shoulder * math.acos(_D_M[3] / radius_m) + math.pi / 2
+        q1 = atan2(p5[1], p5[0]) + shoulder * aside_rad + math.pi / 2
         c1, s1 = cos(q1), sin(q1)
         along_x, along_y = x6[0] * s1 - x6[1] * c1, y6[0] * s1 - y6[1] * c1
         bend = math.hypot(along_x, along_y)

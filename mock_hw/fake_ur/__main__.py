@@ -55,24 +55,26 @@ async def _run(arguments: argparse.Namespace) -> None:
     version = ".".join(map(str, controller.version))
     sys.stdout.write(f"ready host={arguments.host} version={version} fault_port={fault_port}\n")
     sys.stdout.flush()
-    await _cycle(controller, network, streams, stopped)
+    _start_cycle(controller, network, streams)
+    await stopped.wait()
     await network.close()
     await control.close()
 
 
-async def _cycle(
-    controller: Controller, network: Network, streams: rtde.RtdeServer, stopped: asyncio.Event
-) -> None:
+def _start_cycle(controller: Controller, network: Network, streams: rtde.RtdeServer) -> None:
     """Tick at the controller's rate; cycles missed on a busy host are made up for at once."""
-    clock = asyncio.get_running_loop().time
-    start_s = clock()
-    while not stopped.is_set():
-        due = int((clock() - start_s) / controller.period_s)
+    loop = asyncio.get_running_loop()
+    start_s = loop.time()
+
+    def cycle() -> None:
+        due = int((loop.time() - start_s) / controller.period_s)
         if due > controller.cycle:
             controller.tick(due - controller.cycle)
             if not network.frozen:
                 streams.stream()
-        await asyncio.sleep(start_s + (controller.cycle + 1) * controller.period_s - clock())
+        loop.call_at(start_s + (controller.cycle + 1) * controller.period_s, cycle)
+
+    cycle()
 
 
 if __name__ == "__main__":

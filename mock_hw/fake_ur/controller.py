@@ -16,6 +16,7 @@ log = logging.getLogger(__name__)
 
 HOME_RAD = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
 REGISTERS = 48
+_AT_REST = np.zeros(6)
 _QUICK_STOP = {JointWay: 12.0, LineWay: 6.0}
 _UNLOCK_DELAY_S = 5.0
 _BOOT_S = 1.0
@@ -88,8 +89,7 @@ class Controller:
         self.program: Program | None = None
         self.motion: Motion | None = None
         self.joints = np.array(HOME_RAD)
-        self.joint_speeds = np.zeros(6)
-        self.tool0_from_tcp = np.eye(4)
+        self.joint_speeds = _AT_REST
         self.tcp_speed: tuple[float, ...] = (0.0,) * 6
         self.payload_kg = 0.0
         self.payload_cog_m: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -105,7 +105,7 @@ class Controller:
         self._scaled_s = 0.0
         self._stopped_at_s = 0.0
         self._later: list[tuple[float, Callable[[], None]]] = []
-        self.tcp_pose = kinematics.pose_from_transform(self.base_from_tcp())
+        self.set_tcp((0.0,) * 6)
 
     # What the arm is
 
@@ -122,10 +122,13 @@ class Controller:
     @property
     def steady(self) -> bool:
         """Say whether the arm stands still."""
-        return not self.joint_speeds.any()
+        return self.joint_speeds is _AT_REST
 
     def base_from_tcp(self) -> FloatArray:
         """Return the (4, 4) pose of the tool centre point."""
+        return self._base_from_tcp
+
+    def _tcp(self) -> FloatArray:
         pose: FloatArray = kinematics.forward(self.joints) @ self.tool0_from_tcp
         return pose
 
@@ -139,7 +142,8 @@ class Controller:
     def set_tcp(self, pose: Sequence[float]) -> None:
         """Set the tool centre point relative to the flange, as a UR pose."""
         self.tool0_from_tcp = kinematics.transform_from_pose(pose)
-        self.tcp_pose = kinematics.pose_from_transform(self.base_from_tcp())
+        self._base_from_tcp = self._tcp()
+        self.tcp_pose = kinematics.pose_from_transform(self._base_from_tcp)
 
     # What a program may do
 
@@ -298,8 +302,7 @@ class Controller:
 
     def _move(self, elapsed_s: float) -> None:
         if self.motion is None or self.motion.done or elapsed_s <= 0.0:
-            if self.joint_speeds.any():
-                self.joint_speeds, self.tcp_speed = np.zeros(6), (0.0,) * 6
+            self.joint_speeds, self.tcp_speed = _AT_REST, (0.0,) * 6
             return
         self.motion.advance(elapsed_s)
         try:
@@ -311,19 +314,18 @@ class Controller:
             self.protective_stop(str(error))
             return
         self.joints = joints
-        pose = kinematics.pose_from_transform(self.base_from_tcp())
-        self.joint_speeds = speeds if self.motion.rate > 0.0 else np.zeros(6)
-        self.tcp_speed = self._tcp_speed(pose, elapsed_s)
-        self.tcp_pose = pose
+        self.joint_speeds = speeds if self.motion.rate > 0.0 else _AT_REST
+        before, self._base_from_tcp = self._base_from_tcp, self._tcp()
+        self.tcp_pose = kinematics.pose_from_transform(self._base_from_tcp)
+        rest = self.steady
+        self.tcp_speed = (0.0,) * 6 if rest else _speed(before, self._base_from_tcp, elapsed_s)
 
-    def _tcp_speed(self, pose: tuple[float, ...], elapsed_s: float) -> tuple[float, ...]:
-        if self.steady:
-            return (0.0,) * 6
-        before = kinematics.rotation_from_vector(np.array(self.tcp_pose[3:]))
-        after = kinematics.rotation_from_vector(np.array(pose[3:]))
-        turn = kinematics.rotation_vector(after @ before.T)
-        shift = (b - a for a, b in zip(self.tcp_pose[:3], pose[:3], strict=True))
-        return tuple(float(step) / elapsed_s for step in (*shift, *turn))
+
+def _speed(before: FloatArray, after: FloatArray, elapsed_s: float) -> tuple[float, ...]:
+    """Return linear and angular velocity between two poses, both in base."""
+    turn = kinematics.rotation_vector(after[:3, :3] @ before[:3, :3].T)
+    shift = after[:3, 3] - before[:3, 3]
+    return tuple(step / elapsed_s for step in (*shift.tolist(), *turn.tolist()))
 
 
 class Watchdog:

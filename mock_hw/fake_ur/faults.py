@@ -62,7 +62,7 @@ class FaultServer:
             "robot_mode": controller.robot_mode.name,
             "safety_mode": controller.safety_mode.name,
             "runtime_state": controller.runtime_state.name,
-            "moving": bool(controller.joint_speeds.any()),
+            "moving": not controller.steady,
             "joints_rad": controller.joints.tolist(),
             "tcp_pose": list(controller.tcp_pose),
             "payload_kg": controller.payload_kg,

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers import kinematics
@@ -28,6 +28,7 @@ def test_the_stretched_arm_is_as_long_as_the_data_sheet_says():
 
 
 @given(postures, st.floats(-0.3, 0.3))
+@example(np.array([1.0, math.pi / 2, math.pi, math.pi / 2, 0.0, 0.0]), 0.0)
 def test_every_posture_is_found_again_from_nearby(joints, offset_rad):
     near = np.append(joints[:5] + offset_rad, joints[5])
     pose = kinematics.forward(joints)

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -278,3 +280,31 @@ def test_a_refused_script_is_a_refused_move(fake, arm):
     fake.do("reset")
     arm.start_move(linear(down(arm.state(), 0.05)))
     wait_settled(arm, timeout_s=5.0)
+
+
+_HOLDER = """
+import sys, time
+from contracts.arm import down, linear
+from drivers.ur5.arm import Ur5Arm
+from drivers.ur5.messages import Ur5Config
+
+with Ur5Arm(Ur5Config(host=sys.argv[1])) as arm:
+    arm.start_move(linear(down(arm.state(), 0.4), speed_mps=0.01))
+    print(arm._link.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_the_arm_stops_when_the_whole_program_is_killed(fake):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with subprocess.Popen(
+        [sys.executable, "-c", _HOLDER, fake.host], stdout=subprocess.PIPE, env=environment
+    ) as program:
+        child = int(program.stdout.readline())
+        assert fake.do("state")["runtime_state"] == "PLAYING"
+        program.kill()
+    until = time.perf_counter() + 2.0
+    while fake.do("state")["moving"] or os.path.exists(f"/proc/{child}"):
+        assert time.perf_counter() < until
+        time.sleep(0.02)
+    assert fake.do("state")["runtime_state"] == "STOPPED"
