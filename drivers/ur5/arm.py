@@ -116,6 +116,8 @@ class Ur5Arm:
         with self._sending:
             if self._stops != stops:
                 raise MoveInterruptedError("stopped on request before the move began")
+            if self._newest is not None and self._moving(self._newest[0]):
+                raise ArmBusyError("another thread began a move: wait for its end or stop it")
             pending = self._connected().post(request)
             self._move = pending.number
         reply = pending.wait(self._config.command_timeout_s)
@@ -261,6 +263,10 @@ class Ur5Arm:
             self._move == sample.move and sample.status is MoveStatus.MOVING
         )
 
+    def _moving(self, sample: Sample) -> bool:
+        """Say whether a move is under way that nobody has stopped."""
+        return self._under_way(sample) and self._stopped_move != self._move
+
     # What it means
 
     def _fresh(self) -> tuple[Sample, int]:
@@ -295,9 +301,8 @@ class Ur5Arm:
             return hold[0], str(hold[1])
         if self._latch:
             return ArmMode.NOT_ACKNOWLEDGED, f"not acknowledged: {self._latch}"
-        under_way = self._under_way(sample)
-        if under_way and self._stopped_move != self._move:
+        if self._moving(sample):
             return ArmMode.MOVING, ""
-        if under_way or (self._move and sample.status is MoveStatus.STOPPED):
+        if self._under_way(sample) or (self._move and sample.status is MoveStatus.STOPPED):
             return ArmMode.INTERRUPTED, "stopped on request"
         return ArmMode.READY, ""

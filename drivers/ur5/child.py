@@ -45,6 +45,7 @@ _FREQUENCY_HZ = 125.0
 _UPKEEP_S = 0.01
 _WATCH_S = 0.002
 _BEAT_S = 0.05
+_BRAKE_S = 2.0
 _VARIABLES = [
     "timestamp",
     "actual_q",
@@ -53,7 +54,6 @@ _VARIABLES = [
     "actual_TCP_speed",
     "robot_mode",
     "safety_mode",
-    "runtime_state",
 ]
 
 
@@ -137,6 +137,7 @@ class Watch:
         receive = self._receive
         while True:
             stamp_s = receive.getTimestamp()
+            move, status, detail = self._record.now
             sample = Sample(
                 stamp_s=stamp_s,
                 arrived_ns=time.monotonic_ns(),
@@ -147,10 +148,9 @@ class Watch:
                 tool_speed=tuple(receive.getActualTCPSpeed()),
                 robot_mode=receive.getRobotMode(),
                 safety_mode=receive.getSafetyMode(),
-                runtime_state=receive.getRuntimeState(),
-                move=self._record.now[0],
-                status=self._record.now[1],
-                detail=self._record.now[2],
+                move=move,
+                status=status,
+                detail=detail,
             )
             if receive.getTimestamp() == stamp_s:
                 return sample
@@ -170,6 +170,7 @@ class Mover:
         self._uploaded = False
         self._operation = 0
         self._linear = True
+        self._braking = False
 
     def do(self, number: int, request: Request) -> str:
         """Do what the parent asks; return why not, or nothing."""
@@ -193,6 +194,8 @@ class Mover:
             self._record.end(MoveStatus.STOPPED, "stopped on request")
         if not self._runs():
             return
+        if not self._braking:
+            self._operation, self._braking = self._operation_now(), True
         if self._linear:
             self._control.stopL(self._config.stop_deceleration_mps2, True)
         else:
@@ -223,7 +226,7 @@ class Mover:
             if time.monotonic() > until_s:
                 return "the controller did not start the control script"
             time.sleep(_UPKEEP_S)
-        config = self._config
+        config, self._braking = self._config, False
         self._uploaded = (
             self._control.setTcp([0.0] * 6)
             and self._control.setPayload(config.payload_kg, list(config.payload_cog_m))
@@ -234,28 +237,57 @@ class Mover:
     def _move(self, number: int, request: MoveLinear | MoveJoints) -> str:
         if not self._runs():
             return "the control script does not run"
-        self._operation = self._control.getAsyncOperationProgressEx().operationId()
+        if not self._has_braked():
+            return "the arm did not come to rest after the last stop"
+        self._operation = self._operation_now()
         self._linear = isinstance(request, MoveLinear)
         self._record.now = (number, MoveStatus.MOVING, "")
-        if isinstance(request, MoveLinear):
-            target, begin = list(request.pose), self._control.moveL
-            begun = begin(target, request.speed_mps, request.acceleration_mps2, True)
-        else:
-            target, begin = list(request.joints_rad), self._control.moveJ
-            begun = begin(target, request.speed_rps, request.acceleration_rps2, True)
+        try:
+            begun = self._begin(request)
+        except ValueError as error:
+            self._record.end(MoveStatus.NONE)
+            return f"the robot does not take such numbers ({error})"
         if begun:
             return ""
         self._record.end(MoveStatus.NONE)
         self._dashboard.ask("stop")
         return "the controller ended its program instead of beginning the move"
 
-    def _follow(self) -> None:
+    def _begin(self, request: MoveLinear | MoveJoints) -> bool:
+        if isinstance(request, MoveLinear):
+            target, begin = list(request.pose), self._control.moveL
+            return bool(begin(target, request.speed_mps, request.acceleration_mps2, True))
+        target, begin = list(request.joints_rad), self._control.moveJ
+        return bool(begin(target, request.speed_rps, request.acceleration_rps2, True))
+
+    def _has_braked(self) -> bool:
+        """Wait for the end of a stop: a move begun during it would end the program."""
+        until_s = time.monotonic() + _BRAKE_S
+        while self._braking:
+            if time.monotonic() > until_s or not self._runs():
+                return False
+            self._control.kickWatchdog()
+            self._braking = not self._has_ended()
+            time.sleep(_WATCH_S)
+        return True
+
+    def _operation_now(self) -> int:
+        return int(self._control.getAsyncOperationProgressEx().operationId())
+
+    def _has_ended(self) -> bool:
+        """Say whether the operation begun after `_operation` was read has ended.
+
+        The register may still show the operation before it: its number tells.
+        """
         progress = self._control.getAsyncOperationProgressEx()
+        return progress.operationId() != self._operation and not progress.isAsyncOperationRunning()
+
+    def _follow(self) -> None:
         if self._watch.newest.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
             self._interrupt("safety stop")
         elif not self._runs():
             self._interrupt("the program on the controller was ended or paused")
-        elif progress.operationId() != self._operation and not progress.isAsyncOperationRunning():
+        elif self._has_ended():
             self._record.end(MoveStatus.FINISHED)
 
     def _interrupt(self, detail: str) -> None:
@@ -295,6 +327,9 @@ def main(pipe: Connection) -> NoReturn:
         parent.end(*problem)
     try:
         receive, control = _connect(config.host)
+    except RuntimeError as error:
+        parent.end("NotConnectedError", f"{config.host}: {error}")
+    try:
         watch = Watch(receive, parent, record)
         threading.Thread(target=watch.run, daemon=True).start()
         mover = Mover(control, config, watch, record)

@@ -23,7 +23,6 @@ from drivers.ur5.messages import (
 )
 
 _SILENCE_S = 1.0
-_POLL_S = 0.1
 _BACKOFF_S = (0.05, 0.2, 0.5, 1.0)
 
 
@@ -150,8 +149,11 @@ class ChildLink:
                 stdin=subprocess.DEVNULL,
                 env=environment,
             )
-        ours.send(self._config)
         self._pipe = ours
+        if self._closing.is_set():
+            self.kill()
+        else:
+            ours.send(self._config)
         return ours
 
     def _listen(self, pipe: Connection) -> ArmLinkError:

@@ -127,7 +127,6 @@ class Sample:
     tool_speed: Vector
     robot_mode: int
     safety_mode: int
-    runtime_state: int
     move: int
     status: MoveStatus
     detail: str

@@ -60,6 +60,7 @@ class ControlScript:
         self._path = Statements(body, controller, self._signal)
         self._main = self._run()
         self._thread: Cycles | None = None
+        self._stopping = False
         self._failed = False
         self._writes = 0
         self._operation = 0
@@ -136,6 +137,7 @@ class ControlScript:
         elif command in (33, 34):
             yield from self._stop()
         elif command == 45:
+            self._refuse_while_stopping()
             yield from self._start(self._path.run(), asynchronous=self._int(1) == 1)
         else:
             self._answer_at_once(command)
@@ -148,6 +150,7 @@ class ControlScript:
         asynchronous = self._int(1) == 1
         verb = "movej" if command in (1, 2) else "movel"
         is_pose = command in (2, 3)
+        self._refuse_while_stopping()
         self._kill_thread()
         yield from stop(self._controller, acceleration)
         way = way_to(self._controller, verb, target, is_pose=is_pose)
@@ -158,11 +161,18 @@ class ControlScript:
     def _stop(self) -> Cycles:
         (deceleration,) = self._doubles(0, 1)
         self._kill_thread()
-        yield from self._start(stop(self._controller, deceleration), asynchronous=self._int(1) == 1)
+        asynchronous = self._int(1) == 1
+        yield from self._start(stop(self._controller, deceleration), asynchronous=asynchronous)
+        self._stopping = asynchronous
+
+    def _refuse_while_stopping(self) -> None:
+        if self._stopping and self._thread is not None:
+            raise ScriptError("another thread is already controlling the robot")
 
     def _start(self, work: Cycles, *, asynchronous: bool) -> Cycles:
         if asynchronous:
             self._kill_thread()
+            self._stopping = False
             self._thread = self._as_operation(work)
         else:
             yield from work

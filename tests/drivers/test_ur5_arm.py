@@ -1,13 +1,19 @@
 """Ur5Arm, ur-rtde and all, against the fake controller."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from contracts.arm import ArmContract, down, linear
 
 from drivers import kinematics
-from drivers.errors import ControllerFrozenError, NotConnectedError
+from drivers.errors import (
+    ArmBusyError,
+    ControllerFrozenError,
+    MoveRefusedError,
+    NotConnectedError,
+)
 from drivers.protocols import wait_settled
 from drivers.ur5.arm import Ur5Arm
 from drivers.ur5.messages import Ur5Config
@@ -67,6 +73,49 @@ def test_leaving_ends_the_program_and_lets_others_in(fake, make_arm):
             arm.start_move(linear(down(arm.state(), 0.02)))
             wait_settled(arm, timeout_s=5.0)
         assert fake.do("state")["runtime_state"] == "STOPPED"
+
+
+def test_a_move_right_after_a_soft_stop_waits_for_the_rest(fake):
+    config = Ur5Config(host=fake.host, stop_deceleration_mps2=0.05)
+    with Ur5Arm(config) as arm:
+        start = arm.state()
+        arm.start_move(linear(down(start, 0.4)))
+        while arm.state().tool_speed_mps < 0.2:
+            time.sleep(0.001)
+        for _ in range(3):
+            arm.stop()
+        arm.start_move(linear(start.pose.base_from_tool0))
+        end = wait_settled(arm, timeout_s=5.0)
+    assert end.pose.base_from_tool0 == pytest.approx(start.pose.base_from_tool0, abs=1e-6)
+
+
+def test_two_threads_cannot_begin_two_moves(make_arm):
+    with make_arm() as arm, ThreadPoolExecutor(4) as pool:
+        target = down(arm.state(), 0.2)
+
+        def begin():
+            try:
+                arm.start_move(linear(target, speed_mps=0.05))
+            except ArmBusyError:
+                return False
+            return True
+
+        begun = [future.result() for future in [pool.submit(begin) for _ in range(4)]]
+        assert begun.count(True) == 1
+        wait_settled(arm, timeout_s=5.0)
+
+
+def test_numbers_beyond_the_robot_are_refused(make_arm):
+    with make_arm() as arm:
+        with pytest.raises(MoveRefusedError, match="does not take such numbers"):
+            arm.start_move(linear(down(arm.state(), 0.05), speed_mps=50.0))
+        arm.start_move(linear(down(arm.state(), 0.05)))
+        wait_settled(arm, timeout_s=5.0)
+
+
+def test_a_second_driver_is_told_that_the_arm_is_taken(make_arm):
+    with make_arm(), pytest.raises(NotConnectedError, match="already in use"), make_arm():
+        pass
 
 
 def test_seventy_waypoints_take_little_more_than_their_motion(make_arm):

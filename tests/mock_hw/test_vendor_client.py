@@ -165,6 +165,14 @@ def test_a_stopped_move_stays_stopped(client, stop):
     assert client.receive.getActualTCPPose() == rest
 
 
+def test_a_move_during_an_asynchronous_stop_ends_the_program(client):
+    assert client.control.moveL(shifted(client, dz=-0.3), 0.05, 0.5, True)
+    wait_until(lambda: abs(client.receive.getActualTCPSpeed()[2]) > 0.04)
+    client.control.stopL(0.01, True)
+    assert not client.control.moveJ(HOME, 1.0, 1.0)
+    wait_until(lambda: not client.control.isProgramRunning())
+
+
 def test_the_speed_slider_slows_the_clock_of_the_motion(client):
     def speed_with(slider):
         client.io.setSpeedSlider(slider)
