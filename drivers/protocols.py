@@ -169,6 +169,7 @@ class Arm(Protocol):
 
         Raises:
             ArmStoppedError: the cause is still there; the message says what to do.
+            ArmLinkError: the arm cannot be asked.
         """
         ...
 

@@ -5,12 +5,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from contracts.arm import ArmContract, down, linear
+from contracts.arm import ArmContract, assert_stands_still, down, linear
 
 from drivers import kinematics
 from drivers.errors import (
     ArmBusyError,
     ControllerFrozenError,
+    MoveInterruptedError,
     MoveRefusedError,
     NotConnectedError,
 )
@@ -87,6 +88,16 @@ def test_a_move_right_after_a_soft_stop_waits_for_the_rest(fake):
         arm.start_move(linear(start.pose.base_from_tool0))
         end = wait_settled(arm, timeout_s=5.0)
     assert end.pose.base_from_tool0 == pytest.approx(start.pose.base_from_tool0, abs=1e-6)
+
+
+def test_a_stop_before_the_move_has_begun_prevents_it(make_arm):
+    with make_arm() as arm, ThreadPoolExecutor(1) as pool:
+        uploading = pool.submit(arm.start_move, linear(down(arm.state(), 0.2)))
+        time.sleep(0.02)
+        arm.stop()
+        with pytest.raises(MoveInterruptedError, match="before the move began"):
+            uploading.result()
+        assert_stands_still(arm)
 
 
 def test_two_threads_cannot_begin_two_moves(make_arm):

@@ -115,9 +115,40 @@ def test_a_stop_mended_at_the_pendant_still_needs_an_acknowledgement(fake, movin
         wait_settled(arm, timeout_s=2.0)
     time.sleep(UNLOCK_S)
     fake.do("unlock")
+    assert Dashboard(fake.host).ask("play") == "Failed to execute: play"
     time.sleep(0.05)
     with pytest.raises(NotAcknowledgedError, match="protective stop"):
         arm.start_move(linear(target))
+    assert_held_until_acknowledged(fake, arm, target)
+
+
+@pytest.fixture
+def moving_without_watchdog(fake):
+    """As `moving`, but the controller's watchdog is too slow to be of help."""
+    with Ur5Arm(Ur5Config(host=fake.host, watchdog_hz=0.05)) as arm:
+        target = down(arm.state(), WAY_M)
+        arm.start_move(linear(target, speed_mps=0.01))
+        yield arm, target
+
+
+def test_a_stopped_move_is_dropped_at_once_on_the_controller(fake, moving_without_watchdog):
+    arm, target = moving_without_watchdog
+    fake.do("protective_stop")
+    with pytest.raises(ProtectiveStopError):
+        wait_settled(arm, timeout_s=2.0)
+    time.sleep(UNLOCK_S)
+    fake.do("unlock")
+    assert Dashboard(fake.host).ask("play") == "Failed to execute: play"
+    assert_held_until_acknowledged(fake, arm, target)
+
+
+def test_the_death_of_the_driver_process_stops_the_arm_over_the_dashboard(
+    fake, moving_without_watchdog
+):
+    arm, target = moving_without_watchdog
+    os.kill(arm._link.pid, signal.SIGKILL)
+    with pytest.raises(DriverProcessError):
+        wait_settled(arm, timeout_s=2.0)
     assert_held_until_acknowledged(fake, arm, target)
 
 
