@@ -61,6 +61,8 @@ def main(pipe: Connection) -> NoReturn:
         parent.end(*problem)
     try:
         receive, control = _connect(config.host)
+    except ImportError as error:
+        parent.end("NotConnectedError", f"{error}: install ur-rtde (wheels: Python 3.11, 3.12)")
     except RuntimeError as error:
         parent.end("NotConnectedError", f"{config.host}: {error}")
     try:

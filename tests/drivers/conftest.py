@@ -14,6 +14,7 @@ def version():
 
 @pytest.fixture(scope="module")
 def shared_fake(version):
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
     with FakeUr(free_host(), version=version, time_scale=20) as running:
         yield running
 

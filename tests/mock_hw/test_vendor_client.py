@@ -4,16 +4,18 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-import dashboard_client
 import numpy as np
 import pytest
-import rtde_control
-import rtde_io
-import rtde_receive
 
 from drivers import kinematics
 from mock_hw.fake_ur.controller import HOME_RAD
 from mock_hw.fake_ur.process import FakeUr
+
+NO_WHEEL = "ur-rtde has no wheel for this Python"
+dashboard_client = pytest.importorskip("dashboard_client", reason=NO_WHEEL)
+rtde_control = pytest.importorskip("rtde_control", reason=NO_WHEEL)
+rtde_io = pytest.importorskip("rtde_io", reason=NO_WHEEL)
+rtde_receive = pytest.importorskip("rtde_receive", reason=NO_WHEEL)
 
 HOME = list(HOME_RAD)
 
