@@ -1,1 +1,1 @@
-"""Hardware and orchards that answer like the real ones, for development without either."""
+"""Hardware and orchards that answer like the real thing. Shipped: simulation is a product."""

@@ -1,0 +1,308 @@
+"""The UR5 as an Arm: typed reasons for every refusal, and two ways to stop it."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from drivers import kinematics
+from drivers.errors import (
+    ArmBusyError,
+    ArmError,
+    ArmLinkError,
+    ControllerFrozenError,
+    DriverProcessError,
+    MoveInterruptedError,
+    MoveRefusedError,
+    NotConnectedError,
+    NotInRemoteControlError,
+    NotPoweredError,
+    ProtectiveStopError,
+)
+from drivers.protocols import ArmMode, ArmState, Move, ToolPose, raise_unless_movable
+from drivers.ur5.clock import ClockOffset
+from drivers.ur5.dashboard import Dashboard
+from drivers.ur5.link import ChildLink
+from drivers.ur5.messages import MoveStatus, Prepare, Sample, Stop, Ur5Config
+from drivers.ur5.reasons import power_hold, safety_hold
+from drivers.ur5.requests import request_for
+
+log = logging.getLogger(__name__)
+
+_FRESH_NS = 50_000_000
+_UNLOCK_S = 2.0
+
+
+class Ur5Arm:
+    """A UR5 (CB3 or e-Series) behind ur-rtde; see `drivers.protocols.Arm`.
+
+    Poses are the controller's own while our control script runs, which makes the flange the
+    tool centre point; before the first move and after a stop, when another tool centre point
+    may be active, they are nominal kinematics of the measured joints.
+    """
+
+    def __init__(self, config: Ur5Config) -> None:
+        self._config = config
+        self._dashboard = Dashboard(config.host)
+        self._link: ChildLink | None = None
+        self._clock = ClockOffset()
+        self._arrived = threading.Condition()
+        self._newest: tuple[Sample, int] | None = None
+        self._sending = threading.Lock()
+        self._stops = 0
+        self._move = 0
+        self._stopped_move = -1
+        self._latch: ArmError | None = None
+
+    def __enter__(self) -> Self:
+        """Connect; nothing is uploaded to the controller and nothing moves.
+
+        Raises:
+            ArmLinkError: no controller there, or it does not answer.
+        """
+        link = ChildLink(self._config, self._on_sample, self._on_down)
+        link.open()
+        self._link = link
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Stop, end the control script, disconnect."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+            self._newest, self._move, self._latch = None, 0, None
+
+    def state(self) -> ArmState:
+        """Return the newest measurement, waiting for one where the last is getting old.
+
+        Raises:
+            ArmLinkError: there is none younger than `stale_after_s`.
+        """
+        sample, stamp_ns = self._fresh()
+        mode, detail = self._mode(sample)
+        joints = np.asarray(sample.joints_rad)
+        flange = (
+            kinematics.transform_from_pose(sample.tcp_pose)
+            if sample.tcp_is_flange
+            else kinematics.forward(joints)
+        )
+        return ArmState(
+            pose=ToolPose(stamp_ns=stamp_ns, base_from_tool0=flange),
+            joints_rad=joints,
+            joint_speeds_rps=np.asarray(sample.joint_speeds_rps),
+            tool_speed_mps=float(np.linalg.norm(sample.tool_speed[:3])),
+            mode=mode,
+            detail=detail,
+        )
+
+    def start_move(self, move: Move) -> None:
+        """Begin a move after checking that the arm can follow it; see `Arm.start_move`."""
+        stops = self._stops
+        state = self.state()
+        if state.mode is ArmMode.MOVING:
+            raise ArmBusyError("a move is under way: wait for its end or stop it")
+        raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
+        request = request_for(move, state)
+        self._prepare(self._fresh()[0])
+        with self._sending:
+            if self._stops != stops:
+                raise MoveInterruptedError("stopped on request before the move began")
+            if self._newest is not None and self._moving(self._newest[0]):
+                raise ArmBusyError("another thread began a move: wait for its end or stop it")
+            pending = self._connected().post(request)
+            self._move = pending.number
+        reply = pending.wait(self._config.command_timeout_s)
+        if reply is None:
+            raise self._give_up("did not answer a move")
+        if reply.refusal:
+            self._move = 0
+            raise self._why_refused(reply.refusal)
+
+    def stop(self) -> None:
+        """Brake through the child; where that is not confirmed in time, end it and the program.
+
+        Raises:
+            ArmLinkError: neither way is left.
+        """
+        link = self._connected()
+        with self._sending:
+            self._stops += 1
+            pending = link.post(Stop())
+            self._stopped_move = self._move
+        if pending.wait(self._config.stop_timeout_s) is None:
+            link.kill()
+            try:
+                self._dashboard.ask("stop")
+            except OSError as error:
+                raise NotConnectedError(
+                    f"stop not confirmed, {self._config.host} does not answer ({error}):"
+                    " use the emergency stop"
+                ) from error
+
+    def acknowledge(self, reason: str) -> None:
+        """Unlock, power and release the arm after a stop; see `Arm.acknowledge`."""
+        sample, _ = self._fresh()
+        if not (self._latch or safety_hold(sample) or power_hold(sample)):
+            return
+        log.info("%s: acknowledged: %s", self._config.host, reason)
+        try:
+            self._dashboard.ask("stop")
+            self._release(sample)
+            if power_hold(self._fresh()[0]):
+                self._dashboard.ask("power on")
+                self._dashboard.ask("brake release")
+        except OSError as error:
+            raise NotConnectedError(f"{self._config.host} does not answer: {error}") from error
+        timeout_s = self._config.power_timeout_s
+        if not self._wait(lambda sample: not power_hold(sample), timeout_s):
+            raise NotPoweredError(f"not powered and released within {timeout_s} s: see the pendant")
+        self._latch, self._move = None, 0
+
+    def _release(self, sample: Sample) -> None:
+        self._dashboard.ask("close safety popup")
+        hold = safety_hold(sample)
+        if hold is None:
+            return
+        mode, error = hold
+        if mode is not ArmMode.PROTECTIVE_STOP:
+            raise error
+        answer = self._dashboard.ask("unlock protective stop")
+        if not self._wait(lambda sample: not safety_hold(sample), _UNLOCK_S):
+            raise ProtectiveStopError(f"still in protective stop: {answer}")
+
+    # Asking the child
+
+    def _connected(self) -> ChildLink:
+        if self._link is None:
+            raise NotConnectedError("the arm is not connected: use it inside its `with` block")
+        return self._link
+
+    def _prepare(self, sample: Sample) -> None:
+        """Have the control script run; uploading it takes a robot in remote control."""
+        if not sample.tcp_is_flange and self._in_local_control():
+            raise NotInRemoteControlError("switch the controller to remote control")
+        reply = self._connected().post(Prepare()).wait(self._config.connect_timeout_s)
+        if reply is None:
+            raise self._give_up("did not get the control script to run")
+        if reply.refusal:
+            raise self._why_refused(reply.refusal)
+
+    def _in_local_control(self) -> bool:
+        """Ask the dashboard; controllers before 5.6 do not know the question."""
+        try:
+            return self._dashboard.ask("is in remote control") == "false"
+        except OSError as error:
+            raise NotConnectedError(f"{self._config.host} does not answer: {error}") from error
+
+    def _why_refused(self, refusal: str) -> ArmError:
+        try:
+            raise_unless_movable(self.state(), also=(ArmMode.INTERRUPTED,))
+        except ArmError as error:
+            return error
+        return MoveRefusedError(f"{refusal}; see the log of the controller")
+
+    def _give_up(self, what: str) -> ArmError:
+        """Replace a child that does not answer; the program on the controller is ended."""
+        link = self._connected()
+        if link.up:
+            link.kill()
+            return DriverProcessError(f"the arm's driver process {what} and was ended")
+        return link.why_down()
+
+    # What the child says, in the link's thread
+
+    def _on_sample(self, sample: Sample) -> None:
+        cause = self._cause(sample)
+        if cause is not None and self._latch is None:
+            self._latch = cause
+        stamp_ns = self._clock.host_ns(sample.stamp_s, sample.arrived_ns)
+        with self._arrived:
+            self._newest = (sample, stamp_ns)
+            self._arrived.notify_all()
+
+    def _cause(self, sample: Sample) -> ArmError | None:
+        """Return what this sample says must be acknowledged before the next move."""
+        hold = safety_hold(sample)
+        if hold is None and self._under_way(sample):
+            hold = power_hold(sample)
+        if hold is not None:
+            return hold[1]
+        if sample.move == self._move and sample.status is MoveStatus.INTERRUPTED:
+            return MoveInterruptedError(sample.detail)
+        return None
+
+    def _on_down(self, error: ArmLinkError) -> None:
+        log.warning("%s: %s", self._config.host, error)
+        with self._arrived:
+            newest, self._newest = self._newest, None
+            self._arrived.notify_all()
+        if newest is not None and self._under_way(newest[0]):
+            self._latch = self._latch or error
+            self._end_program()
+        self._move = 0
+        self._clock = ClockOffset()
+
+    def _end_program(self) -> None:
+        try:
+            self._dashboard.ask("stop")
+        except OSError as error:
+            log.warning("%s: dashboard stop: %s; left to the watchdog", self._config.host, error)
+
+    def _under_way(self, sample: Sample) -> bool:
+        """Say whether the newest move is not known to have ended."""
+        return self._move > sample.move or (
+            self._move == sample.move and sample.status is MoveStatus.MOVING
+        )
+
+    def _moving(self, sample: Sample) -> bool:
+        """Say whether a move is under way that nobody has stopped."""
+        return self._under_way(sample) and self._stopped_move != self._move
+
+    # What it means
+
+    def _fresh(self) -> tuple[Sample, int]:
+        link = self._connected()
+        with self._arrived:
+            newest = self._newest
+            if newest and time.monotonic_ns() - newest[0].arrived_ns < _FRESH_NS:
+                return newest
+            if link.up:
+                self._arrived.wait_for(
+                    lambda: self._newest is not newest, self._config.stale_after_s
+                )
+            if self._newest is not None and self._newest is not newest:
+                return self._newest
+        if not link.up:
+            raise link.why_down()
+        raise ControllerFrozenError(
+            f"{self._config.host} has sent nothing for {self._config.stale_after_s} s"
+        )
+
+    def _wait(self, wanted: Callable[[Sample], bool], timeout_s: float) -> bool:
+        until_s = time.perf_counter() + timeout_s
+        while not wanted(self._fresh()[0]):
+            if time.perf_counter() > until_s:
+                return False
+            time.sleep(0.01)
+        return True
+
+    def _mode(self, sample: Sample) -> tuple[ArmMode, str]:
+        hold = safety_hold(sample) or power_hold(sample)
+        if hold:
+            return hold[0], str(hold[1])
+        if self._latch:
+            return ArmMode.NOT_ACKNOWLEDGED, f"not acknowledged: {self._latch}"
+        if self._moving(sample):
+            return ArmMode.MOVING, ""
+        if self._under_way(sample) or (self._move and sample.status is MoveStatus.STOPPED):
+            return ArmMode.INTERRUPTED, "stopped on request"
+        return ArmMode.READY, ""

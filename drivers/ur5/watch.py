@@ -1,0 +1,125 @@
+"""The child's watch thread: every package of the controller goes to the parent."""
+
+import os
+import threading
+import time
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, NoReturn
+
+from drivers.ur5.messages import Answer, Beat, Command, Farewell, MoveStatus, Sample
+
+if TYPE_CHECKING:
+    from rtde_receive import RTDEReceiveInterface
+
+VARIABLES = [
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "robot_mode",
+    "safety_mode",
+]
+"""RTDE variables a sample is made of."""
+
+_PERIOD_S = 0.002
+_BEAT_S = 0.05
+
+
+class Parent:
+    """The pipe to the parent, shared by both threads."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
+        self._lock = threading.Lock()
+
+    def send(self, answer: Answer) -> None:
+        """Send; without a parent there is nothing left to do."""
+        try:
+            with self._lock:
+                self._pipe.send(answer)
+        except OSError:
+            os._exit(0)
+
+    def receive(self, timeout_s: float) -> Command | None:
+        """Return the next command, None when there is none in time.
+
+        Raises:
+            EOFError: the parent is gone.
+        """
+        command: Command | None = self._pipe.recv() if self._pipe.poll(timeout_s) else None
+        return command
+
+    def end(self, error: str, text: str) -> NoReturn:
+        """Say why and end the process here and now."""
+        self.send(Farewell(error, text))
+        os._exit(1)
+
+
+class MoveRecord:
+    """What the main thread lets the watch thread know.
+
+    now: number, status and detail of the newest move. tcp_is_flange: our script runs.
+    """
+
+    def __init__(self) -> None:
+        self.now: tuple[int, MoveStatus, str] = (0, MoveStatus.NONE, "")
+        self.tcp_is_flange = False
+
+    @property
+    def moving(self) -> bool:
+        """Say whether a move is under way."""
+        return self.now[1] is MoveStatus.MOVING
+
+    def end(self, status: MoveStatus, detail: str = "") -> None:
+        """Note that the move under way has ended."""
+        self.now = (self.now[0], status, detail)
+
+
+class Watch:
+    """Sends every package of the controller to the parent."""
+
+    def __init__(self, receive: "RTDEReceiveInterface", parent: Parent, record: MoveRecord) -> None:
+        self._receive = receive
+        self._parent = parent
+        self._record = record
+        self.newest = self._sample()
+
+    def run(self) -> NoReturn:
+        """Watch until the link is lost."""
+        spoken_s = 0.0
+        while True:
+            if not self._receive.isConnected():
+                self._parent.end("LinkLostError", "the RTDE connection broke")
+            now_s = time.monotonic()
+            if self._receive.getTimestamp() != self.newest.stamp_s:
+                self.newest = self._sample()
+                self._parent.send(self.newest)
+                spoken_s = now_s
+            elif now_s - spoken_s > _BEAT_S:
+                self._parent.send(Beat())
+                spoken_s = now_s
+            time.sleep(_PERIOD_S)
+
+    def _sample(self) -> Sample:
+        """Read one package: the getters lock one by one, so an unchanged stamp must frame them."""
+        receive = self._receive
+        while True:
+            stamp_s = receive.getTimestamp()
+            move, status, detail = self._record.now
+            sample = Sample(
+                stamp_s=stamp_s,
+                arrived_ns=time.monotonic_ns(),
+                tcp_pose=tuple(receive.getActualTCPPose()),
+                tcp_is_flange=self._record.tcp_is_flange,
+                joints_rad=tuple(receive.getActualQ()),
+                joint_speeds_rps=tuple(receive.getActualQd()),
+                tool_speed=tuple(receive.getActualTCPSpeed()),
+                robot_mode=receive.getRobotMode(),
+                safety_mode=receive.getSafetyMode(),
+                move=move,
+                status=status,
+                detail=detail,
+            )
+            if receive.getTimestamp() == stamp_s:
+                return sample
