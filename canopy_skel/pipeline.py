@@ -80,6 +80,11 @@ class Skeletonizer:
         self._rejected: list[RejectedInstance] = []
 
     @property
+    def config(self) -> MethodConfig:
+        """The method and its settings."""
+        return self._config
+
+    @property
     def views(self) -> tuple[int, ...]:
         """The indices of the views that are in, ascending."""
         return tuple(sorted(self._splines))

@@ -9,7 +9,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array
+from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array, UInt16Array
 from canopy_skel.geometry import FloatArray, is_rigid
 from drivers.errors import (
     ArmError,
@@ -179,7 +179,8 @@ class CameraImage:
     """One exposure.
 
     stamp_ns: the middle of the exposure on the host clock (`time.monotonic_ns`). color_rgb:
-    (H, W, 3) uint8. depth_m: (H, W) float32 aligned to colour, NaN = no return.
+    (H, W, 3) uint8. depth_m: (H, W) float32 aligned to colour, NaN = no return. instances,
+    scores: branch masks of cameras that know them (simulated, replayed), as in `View`.
     """
 
     stamp_ns: int
@@ -187,6 +188,8 @@ class CameraImage:
     intrinsics: Intrinsics
     depth_m: Float32Array | None = None
     stereo: StereoPair | None = None
+    instances: UInt16Array | None = None
+    scores: tuple[float, ...] | None = None
 
 
 class Camera(Protocol):

@@ -4,27 +4,22 @@ import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from canopy_skel.document import Method, RejectedView, SkeletonDocument, build_document
+from canopy_skel.document import RejectedView, SkeletonDocument
 from canopy_skel.errors import RecordingError, UsageError, ViewError
 from canopy_skel.exports import FORMATS
 from canopy_skel.exports.overlay import draw_overlay
 from canopy_skel.frame import View
 from canopy_skel.pipeline import Extraction, MethodConfig, Skeletonizer
 from canopy_skel.recording import Recording, TopicOptions, read_recording
-from canopy_skel.segment import Segmenter
-from canopy_skel.segmenters.recorded import RecordedSegmenter
 from drivers.stereo import with_depth
 from service.outputs import write_all
+from service.skeletons import SEGMENTERS, document_of
 from service.stopwatch import Stopwatch
-
-SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"recorded": RecordedSegmenter}
-SOFTWARE = f"canopy-skel {version('canopy-skel')}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,18 +83,8 @@ def replay(
     walk = _walk_views(recording, request, stopwatch, progress)
     extraction = walk.skeletonizer.skeleton()
     with stopwatch("document"):
-        document = build_document(
-            extraction.graph,
-            scan_id=recording.scan_id,
-            revision=len(walk.skeletonizer.views),
-            method=Method(
-                name=request.config.name,
-                voxel_size_m=request.config.likelihood.voxel_size_m,
-                config_sha256=request.config.sha256(),
-                software=SOFTWARE,
-            ),
-            views_used=len(walk.skeletonizer.views),
-            views_rejected=walk.rejected,
+        document = document_of(
+            walk.skeletonizer, extraction, scan_id=recording.scan_id, rejected=walk.rejected
         )
     with stopwatch("export"):
         contents = _files(path.stem, document, walk, request)

@@ -1,0 +1,163 @@
+"""What the HTTP side knows of arm, camera and scans; `service.scan` and `compose` stand behind."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Protocol
+
+from canopy_skel.geometry import FloatArray
+from canopy_skel.pipeline import MethodConfig
+
+
+class ScanState(StrEnum):
+    """Where a scan is. STOPPED: motion was dropped and an operator must acknowledge, then resume."""
+
+    RUNNING = "running"
+    PAUSED = "paused"
+    STOPPED = "stopped"
+    DONE = "done"
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+
+
+FINISHED = frozenset({ScanState.DONE, ScanState.CANCELLED, ScanState.FAILED})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class ScanSpec:
+    """What to scan and how.
+
+    waypoints: base_from_tool0 (4, 4) of each exposure, in order. speed_mps,
+    acceleration_mps2: of the flange between them. retakes: further tries for a bad picture.
+    """
+
+    scan_id: str
+    tree_id: str
+    waypoints: tuple[FloatArray, ...]
+    config: MethodConfig
+    segmenter: str = "recorded"
+    speed_mps: float = 0.25
+    acceleration_mps2: float = 0.5
+    settle_timeout_s: float = 20.0
+    grab_timeout_s: float = 10.0
+    retakes: int = 2
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanStatus:
+    """A scan at a moment. detail: one line on why it is in this state, empty while all is well."""
+
+    scan_id: str
+    tree_id: str
+    state: ScanState
+    views_done: int
+    views_total: int
+    detail: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WaypointVerdict:
+    """Whether a waypoint can be driven to; reason is empty if so."""
+
+    index: int
+    reachable: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RigEvent:
+    """Something that happened, for operators and the journal. kind: short, e.g. "view"."""
+
+    scan_id: str
+    kind: str
+    fields: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PartStatus:
+    """Whether a part of the rig (arm, camera, worker, disk) can be used; detail names the mend."""
+
+    name: str
+    ready: bool
+    detail: str = ""
+
+
+class RigError(Exception):
+    """Base of what a rig can refuse; the message names the thing and the mend."""
+
+
+class RigBusyError(RigError):
+    """A scan is under way."""
+
+
+class RigNotReadyError(RigError):
+    """Arm or camera cannot be used now."""
+
+
+class PlanRefusedError(RigError):
+    """A waypoint cannot be driven to, or a speed is over the cap; nothing moved."""
+
+    def __init__(self, message: str, verdicts: Sequence[WaypointVerdict] = ()) -> None:
+        super().__init__(message)
+        self.verdicts = tuple(verdicts)
+
+
+class UnknownScanError(RigError):
+    """There is no such scan under way."""
+
+
+class Rig(Protocol):
+    """One arm with its camera and worker. Every method may be called from any thread."""
+
+    def plan(self, spec: ScanSpec) -> list[WaypointVerdict]:
+        """Check every waypoint; nothing moves."""
+        ...
+
+    def start(self, spec: ScanSpec) -> ScanStatus:
+        """Begin a scan and return; events tell how it goes.
+
+        Raises:
+            RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved.
+        """
+        ...
+
+    def pause(self, scan_id: str) -> ScanStatus:
+        """Stop the arm and keep the scan. Raises UnknownScanError."""
+        ...
+
+    def resume(self, scan_id: str) -> ScanStatus:
+        """Go on at the first waypoint that is missing. Raises UnknownScanError, RigNotReadyError."""
+        ...
+
+    def cancel(self, scan_id: str) -> ScanStatus:
+        """Stop the arm and end the scan; its recording stays. Raises UnknownScanError."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the arm now; never queued, harmless when repeated."""
+        ...
+
+    def acknowledge(self, reason: str) -> None:
+        """An operator has looked and says why moving is safe again. Raises RigNotReadyError."""
+        ...
+
+    def status(self, scan_id: str) -> ScanStatus:
+        """Return the scan as it is. Raises UnknownScanError."""
+        ...
+
+    def parts(self) -> list[PartStatus]:
+        """Return arm, camera, worker and disk."""
+        ...
+
+    def recording_path(self, scan_id: str) -> Path:
+        """Return where the scan's recording is (`.part` while it grows). Raises UnknownScanError."""
+        ...
+
+    def skeleton(self, scan_id: str) -> bytes | None:
+        """Return the newest skeleton document (JSON) of a scan; None while there is none."""
+        ...
+
+    def subscribe(self, listener: Callable[[RigEvent], None]) -> None:
+        """Call `listener` for every event, from any thread; it must return at once."""
+        ...
