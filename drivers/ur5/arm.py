@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 _FRESH_NS = 50_000_000
 _UNLOCK_S = 2.0
+_LAG_S = 0.03
+"""The state may reach us this much later than its consequences."""
 
 
 class Ur5Arm:
@@ -204,6 +206,7 @@ class Ur5Arm:
             raise NotConnectedError(f"{self._config.host} does not answer: {error}") from error
 
     def _why_refused(self, refusal: str) -> ArmError:
+        time.sleep(_LAG_S)
         try:
             raise_unless_movable(self.state(), also=(ArmMode.INTERRUPTED,))
         except ArmError as error:

@@ -1,5 +1,6 @@
 """The child's hand on the control interface: has the script run, starts moves, follows them."""
 
+import math
 import time
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 _POLL_S = 0.005
 _BRAKE_S = 2.0
+_CAUSE_S = 0.02
+"""The two connections lag each other: a program may be seen to end before the reason for it is."""
 
 
 class Mover:
@@ -37,6 +40,7 @@ class Mover:
         self._operation = 0
         self._linear = True
         self._braking = False
+        self._not_running_since_s = math.inf
 
     def do(self, number: int, request: Request) -> str:
         """Do what the parent asks; return why not, or nothing."""
@@ -107,6 +111,7 @@ class Mover:
             return "the arm did not come to rest after the last stop"
         self._operation = self._operation_now()
         self._linear = isinstance(request, MoveLinear)
+        self._not_running_since_s = math.inf
         self._record.now = (number, MoveStatus.MOVING, "")
         try:
             begun = self._begin(request)
@@ -149,10 +154,13 @@ class Mover:
         return progress.operationId() != self._operation and not progress.isAsyncOperationRunning()
 
     def _follow(self) -> None:
-        if self._watch.newest.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+        newest = self._watch.newest
+        if newest.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
             self._interrupt("safety stop")
         elif not self._runs():
-            self._interrupt("the program on the controller was ended or paused")
+            self._not_running_since_s = min(self._not_running_since_s, newest.stamp_s)
+            if newest.stamp_s - self._not_running_since_s > _CAUSE_S:
+                self._interrupt("the program on the controller was ended or paused")
         elif self._has_ended():
             self._record.end(MoveStatus.FINISHED)
 
