@@ -1,5 +1,6 @@
 """Recordings (MCAP): read, write, recover and cut; nothing else in the method touches files."""
 
+from canopy_skel.recording.carry import carry_over
 from canopy_skel.recording.encode import EncodedPicture, encode_view
 from canopy_skel.recording.options import ROS2_TOPICS, TopicOptions
 from canopy_skel.recording.reader import Recording, TopicSummary, read_recording
@@ -14,6 +15,7 @@ __all__ = [
     "RecoverReport",
     "TopicOptions",
     "TopicSummary",
+    "carry_over",
     "cut_recording",
     "encode_view",
     "read_recording",

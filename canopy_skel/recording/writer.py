@@ -115,7 +115,12 @@ class RecordingWriter:
 
     def write_event(self, stamp_ns: int, event: Mapping[str, object]) -> None:
         """Write an entry of the journal; it is on disk when this returns."""
-        message = Message(topic=EVENT.name, stamp_ns=stamp_ns, sequence=0, data=encode_json(event))
+        self.write_journal(
+            Message(topic=EVENT.name, stamp_ns=stamp_ns, sequence=0, data=encode_json(event))
+        )
+
+    def write_journal(self, message: Message) -> None:
+        """Write an entry of the journal that is encoded already."""
         with _disk_errors(self._path):
             self._add(message)
             self._writer.flush()

@@ -1,0 +1,314 @@
+"""The rig of this machine: one arm, one camera, one worker, one scan at a time."""
+
+import logging
+import shutil
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from canopy_skel.geometry import FloatArray
+from drivers.errors import ArmError, ArmStoppedError, CameraError, DriverError, MoveRefusedError
+from drivers.guarded_arm import Limits
+from drivers.protocols import Arm, Camera, raise_unless_movable
+from drivers.waypoints import after, move_to
+from service.rig import (
+    FINISHED,
+    PartStatus,
+    PlanRefusedError,
+    RigBusyError,
+    RigEvent,
+    RigNotReadyError,
+    ScanSpec,
+    ScanState,
+    ScanStatus,
+    UnknownScanError,
+    WaypointVerdict,
+)
+from service.scan import ScanSession, ScanTools
+
+log = logging.getLogger(__name__)
+
+ENOUGH_DISK_BYTES = 1 << 30
+STOP_TIMEOUT_S = 10.0
+
+
+class Feed(Protocol):
+    """Where views go to become a skeleton; nothing here may block."""
+
+    def begin(self, spec: ScanSpec, path: Path) -> None:
+        """A scan begins, or goes on; its recording grows at `path` (`.part`)."""
+        ...
+
+    def offer(self, scan_id: str, index: int) -> None:
+        """A view is safe on disk."""
+        ...
+
+    def skeleton(self, scan_id: str) -> bytes | None:
+        """Return the newest skeleton document, None while there is none."""
+        ...
+
+    def worker(self) -> PartStatus:
+        """Say whether a worker is there."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class RigParts:
+    """What a rig is made of. tool_from_camera: (4, 4), the hand-eye calibration."""
+
+    arm: Arm
+    camera: Camera
+    limits: Limits
+    tool_from_camera: FloatArray
+    feed: Feed
+    data: Path
+
+
+class LocalRig:
+    """See `service.rig.Rig`. A context manager; leaving it stops the arm and the scan."""
+
+    def __init__(self, parts: RigParts) -> None:
+        self._parts = parts
+        self._lock = threading.Lock()
+        self._open = ExitStack()
+        self._opened: set[str] = set()
+        self._sessions: dict[str, tuple[ScanSpec, ScanSession]] = {}
+        self._stopped_reason: str | None = None
+        self._listeners: list[Callable[[RigEvent], None]] = []
+
+    def __enter__(self) -> "LocalRig":
+        """Open arm and camera as far as they are there; what is missing is told by `parts`."""
+        for name in ("arm", "camera"):
+            try:
+                self._ensure_open(name)
+            except DriverError as error:
+                log.warning("%s is not there yet: %s", name, error)
+        return self
+
+    def __exit__(self, *reasons: object) -> None:
+        """End a scan under way, keeping its recording, and close arm and camera."""
+        for scan_id in [*self._sessions]:
+            session = self._sessions[scan_id][1]
+            if session.status.state is ScanState.RUNNING:
+                self._interrupt(session, ScanState.PAUSED)
+        self._open.close()
+
+    def plan(self, spec: ScanSpec) -> list[WaypointVerdict]:
+        """Check every waypoint in order, from where the arm is; nothing moves."""
+        self._ensure_ready("arm")
+        state = self._parts.arm.state()
+        verdicts = []
+        for index, waypoint in enumerate(spec.waypoints):
+            try:
+                move = move_to(
+                    state,
+                    waypoint,
+                    self._parts.limits,
+                    speed_mps=spec.speed_mps,
+                    acceleration_mps2=spec.acceleration_mps2,
+                )
+            except MoveRefusedError as error:
+                verdicts.append(WaypointVerdict(index=index, reachable=False, reason=str(error)))
+                continue
+            verdicts.append(WaypointVerdict(index=index, reachable=True))
+            state = after(state, move)
+        return verdicts
+
+    def start(self, spec: ScanSpec) -> ScanStatus:
+        """Begin a scan; see `Rig.start`."""
+        with self._lock:
+            self._require_free()
+            self._require_startable()
+            verdicts = self.plan(spec)
+            if not all(verdict.reachable for verdict in verdicts):
+                bad = [v for v in verdicts if not v.reachable]
+                raise PlanRefusedError(
+                    f"{len(bad)} of {len(verdicts)} waypoints cannot be driven to; the first:"
+                    f" waypoint {bad[0].index}: {bad[0].reason}",
+                    verdicts,
+                )
+            return self._launch(spec)
+
+    def pause(self, scan_id: str) -> ScanStatus:
+        """Stop the arm and keep the scan."""
+        _, session = self._session(scan_id)
+        self._interrupt(session, ScanState.PAUSED)
+        return session.status
+
+    def resume(self, scan_id: str) -> ScanStatus:
+        """Go on at the first missing waypoint."""
+        with self._lock:
+            spec, session = self._session(scan_id)
+            if session.status.state in FINISHED:
+                raise RigNotReadyError(f"scan {scan_id} is {session.status.state}; start a new one")
+            self._require_free()
+            self._require_startable()
+            return self._launch(spec)
+
+    def cancel(self, scan_id: str) -> ScanStatus:
+        """Stop the arm and end the scan; what was recorded stays."""
+        _, session = self._session(scan_id)
+        self._interrupt(session, ScanState.CANCELLED)
+        session.conclude(ScanState.CANCELLED)
+        return session.status
+
+    def stop(self) -> None:
+        """Stop the arm now, whatever is under way; an acknowledgement is needed afterwards."""
+        self._stopped_reason = "stopped by the operator"
+        running = [s for _, s in self._sessions.values() if s.status.state is ScanState.RUNNING]
+        if not running:
+            self._parts.arm.stop()
+        for session in running:
+            session.interrupt(ScanState.STOPPED)
+
+    def acknowledge(self, reason: str) -> None:
+        """Let the arm move again; a scan goes on only by `resume`."""
+        try:
+            self._ensure_open("arm")
+            self._parts.arm.acknowledge(reason)
+        except ArmError as error:
+            raise RigNotReadyError(f"{type(error).__name__}: {error}") from error
+        self._stopped_reason = None
+        self._tell("", "acknowledged", {"reason": reason})
+
+    def status(self, scan_id: str) -> ScanStatus:
+        """Return the scan as it is."""
+        return self._session(scan_id)[1].status
+
+    def parts(self) -> list[PartStatus]:
+        """Return arm, camera, worker and disk."""
+        return [
+            self._arm_status(),
+            self._camera_status(),
+            self._parts.feed.worker(),
+            self._disk_status(),
+        ]
+
+    def recording_path(self, scan_id: str) -> Path:
+        """Return the recording, or what there is of it."""
+        path = self._path(scan_id)
+        for candidate in (path, path.with_name(path.name + ".part")):
+            if candidate.exists():
+                return candidate
+        raise UnknownScanError(f"there is no recording of scan {scan_id}")
+
+    def skeleton(self, scan_id: str) -> bytes | None:
+        """Return the newest skeleton document of a scan."""
+        return self._parts.feed.skeleton(scan_id)
+
+    def subscribe(self, listener: Callable[[RigEvent], None]) -> None:
+        """Call `listener` for every event."""
+        self._listeners.append(listener)
+
+    def adopt(self, spec: ScanSpec) -> None:
+        """Take over a scan that an earlier run of the service left unfinished; it can be resumed.
+
+        Its recording stays as it is until then.
+        """
+        session = self._session_for(spec)
+        session.conclude(ScanState.STOPPED)
+        self._sessions[spec.scan_id] = (spec, session)
+
+    def _launch(self, spec: ScanSpec) -> ScanStatus:
+        session = self._session_for(spec)
+        self._sessions[spec.scan_id] = (spec, session)
+        session.path.parent.mkdir(parents=True, exist_ok=True)
+        self._parts.feed.begin(spec, session.path)
+        session.start()
+        return session.status
+
+    def _session_for(self, spec: ScanSpec) -> ScanSession:
+        parts = self._parts
+        return ScanSession(
+            spec,
+            ScanTools(
+                arm=parts.arm,
+                camera=parts.camera,
+                limits=parts.limits,
+                tool_from_camera=parts.tool_from_camera,
+            ),
+            self._path(spec.scan_id),
+            report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),
+            recorded=lambda index: parts.feed.offer(spec.scan_id, index),
+        )
+
+    def _interrupt(self, session: ScanSession, wanted: ScanState) -> None:
+        session.interrupt(wanted)
+        if not session.join(STOP_TIMEOUT_S):
+            raise RigNotReadyError(
+                f"the arm was told to stop but the scan has not ended within {STOP_TIMEOUT_S:.0f} s;"
+                " look at the arm, then try again"
+            )
+
+    def _session(self, scan_id: str) -> tuple[ScanSpec, ScanSession]:
+        if scan_id not in self._sessions:
+            raise UnknownScanError(f"there is no scan {scan_id} on this rig")
+        return self._sessions[scan_id]
+
+    def _path(self, scan_id: str) -> Path:
+        return self._parts.data / "scans" / scan_id / f"{scan_id}.mcap"
+
+    def _require_free(self) -> None:
+        for spec, session in self._sessions.values():
+            if session.status.state is ScanState.RUNNING:
+                raise RigBusyError(
+                    f"scan {spec.scan_id} is under way; wait for it, or pause or cancel it"
+                )
+
+    def _require_startable(self) -> None:
+        if self._stopped_reason:
+            raise RigNotReadyError(
+                f"the arm was {self._stopped_reason}: look at it, then acknowledge with a reason"
+            )
+        self._ensure_ready("arm")
+        self._ensure_ready("camera")
+        for part in (self._arm_status(), self._disk_status()):
+            if not part.ready:
+                raise RigNotReadyError(f"{part.name}: {part.detail}")
+
+    def _ensure_ready(self, name: str) -> None:
+        try:
+            self._ensure_open(name)
+        except DriverError as error:
+            raise RigNotReadyError(f"{name}: {type(error).__name__}: {error}") from error
+
+    def _ensure_open(self, name: str) -> None:
+        if name not in self._opened:
+            self._open.enter_context(getattr(self._parts, name))
+            self._opened.add(name)
+
+    def _arm_status(self) -> PartStatus:
+        try:
+            self._ensure_open("arm")
+            raise_unless_movable(self._parts.arm.state())
+        except ArmStoppedError as error:
+            return PartStatus(name="arm", ready=False, detail=f"{error}; mend it, then acknowledge")
+        except ArmError as error:
+            busy = any(s.status.state is ScanState.RUNNING for _, s in self._sessions.values())
+            return PartStatus(name="arm", ready=busy, detail=f"{type(error).__name__}: {error}")
+        if self._stopped_reason:
+            return PartStatus(
+                name="arm", ready=False, detail=f"{self._stopped_reason}; acknowledge"
+            )
+        return PartStatus(name="arm", ready=True)
+
+    def _camera_status(self) -> PartStatus:
+        try:
+            self._ensure_open("camera")
+        except CameraError as error:
+            return PartStatus(name="camera", ready=False, detail=str(error))
+        return PartStatus(name="camera", ready=True)
+
+    def _disk_status(self) -> PartStatus:
+        self._parts.data.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(self._parts.data).free
+        detail = "" if free >= ENOUGH_DISK_BYTES else f"only {free >> 20} MiB free; make room"
+        return PartStatus(name="disk", ready=not detail, detail=detail)
+
+    def _tell(self, scan_id: str, kind: str, fields: dict[str, object]) -> None:
+        event = RigEvent(scan_id=scan_id, kind=kind, fields=fields)
+        for listener in self._listeners:
+            listener(event)

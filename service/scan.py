@@ -1,0 +1,241 @@
+"""One scan: plan -> move -> settle -> capture -> quality gate -> next, with a journal.
+
+A session runs in a thread of its own until the scan is done or something stops it; it then leaves
+the recording unfinished (`.part`), and going on is a new session that carries the whole views over
+and begins at the first missing waypoint. There is no other way to continue, so the way after a
+power cut is the way after a pause.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from canopy_skel.errors import CanopyError
+from canopy_skel.frame import View
+from canopy_skel.geometry import FloatArray
+from canopy_skel.recording import RecordingWriter, carry_over
+from drivers.errors import DriverError
+from drivers.guarded_arm import Limits
+from drivers.protocols import Arm, ArmState, Camera, CameraImage, raise_unless_movable, wait_settled
+from drivers.quality import QualityLimits, flaws, moved
+from drivers.waypoints import move_to
+from service.rig import ScanSpec, ScanState, ScanStatus
+
+log = logging.getLogger(__name__)
+
+Report = Callable[[str, dict[str, object]], None]
+
+
+class ScanInterruptedError(Exception):
+    """The operator paused or cancelled the scan."""
+
+
+class PictureRefusedError(Exception):
+    """No try at a waypoint gave a good picture."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class ScanTools:
+    """What a scan works with. tool_from_camera: (4, 4), the hand-eye calibration."""
+
+    arm: Arm
+    camera: Camera
+    limits: Limits
+    tool_from_camera: FloatArray
+    quality: QualityLimits = field(default_factory=QualityLimits)
+
+
+class ScanSession:
+    """Drives one scan from where it is to its end, or until it is interrupted or stopped.
+
+    `report(kind, fields)` is told of everything that happens, from the session's thread;
+    `recorded(index)` that a view is safe on disk.
+    """
+
+    def __init__(
+        self,
+        spec: ScanSpec,
+        tools: ScanTools,
+        path: Path,
+        *,
+        report: Report,
+        recorded: Callable[[int], None],
+    ) -> None:
+        self.path = path
+        self._spec = spec
+        self._tools = tools
+        self._report = report
+        self._recorded = recorded
+        self._wanted: ScanState | None = None
+        self._state = ScanState.RUNNING
+        self._detail = ""
+        self._done: set[int] = set()
+        self._lock = threading.Lock()
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._thread = threading.Thread(target=self._run, name=f"scan-{spec.scan_id}", daemon=True)
+
+    def start(self) -> None:
+        """Begin, in a thread."""
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the session to end; say whether it has."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    @property
+    def status(self) -> ScanStatus:
+        """The scan as it is now."""
+        with self._lock:
+            return ScanStatus(
+                scan_id=self._spec.scan_id,
+                tree_id=self._spec.tree_id,
+                state=self._state,
+                views_done=len(self._done),
+                views_total=len(self._spec.waypoints),
+                detail=self._detail,
+            )
+
+    def interrupt(self, wanted: ScanState) -> None:
+        """Stop the arm at once and end the session as `wanted`.
+
+        When this returns, the session begins no further motion. The first stop does not wait for
+        the lock, which is held while a move is being begun; the second is for that move.
+        """
+        self._tools.arm.stop()
+        with self._lock:
+            if self._state is not ScanState.RUNNING:
+                return
+            self._wanted = self._wanted or wanted
+        self._tools.arm.stop()
+
+    def conclude(self, state: ScanState) -> None:
+        """Set the state of a session that does not run: an operator's decision, or a take-over."""
+        with self._lock:
+            if self._state is not ScanState.RUNNING or not self._thread.is_alive():
+                self._state = state
+
+    def _run(self) -> None:
+        try:
+            self._scan()
+        except ScanInterruptedError:
+            self._end(self._wanted or ScanState.PAUSED, "")
+        except (DriverError, CanopyError, PictureRefusedError) as error:
+            # An interruption makes the driver complain of the move it cut short.
+            interrupted = self._wanted is not None
+            state = (self._wanted or ScanState.STOPPED) if interrupted else ScanState.STOPPED
+            self._end(state, "" if interrupted else f"{type(error).__name__}: {error}")
+        except Exception as error:
+            log.exception("scan %s failed", self._spec.scan_id)
+            self._end(ScanState.FAILED, f"{type(error).__name__}: {error}")
+
+    def _scan(self) -> None:
+        metadata = {"scan_id": self._spec.scan_id, "tree_id": self._spec.tree_id}
+        metadata["config_sha256"] = self._spec.config.sha256()
+        source = set_aside(self.path)
+        with RecordingWriter(
+            self.path, metadata, tool_from_camera=self._tools.tool_from_camera
+        ) as writer:
+            if source is not None:
+                self._done.update(carry_over(source, writer))
+                source.unlink()
+                for index in sorted(self._done):
+                    self._recorded(index)
+            self._note(writer, "running", views_done=len(self._done))
+            try:
+                self._visit_all(writer)
+            except (DriverError, PictureRefusedError, ScanInterruptedError) as error:
+                self._note(writer, "interrupted", reason=str(error))
+                raise
+            self._note(writer, "done", views_done=len(self._done))
+        self._end(ScanState.DONE, "")
+
+    def _visit_all(self, writer: RecordingWriter) -> None:
+        for index, waypoint in enumerate(self._spec.waypoints):
+            if index in self._done:
+                continue
+            self._check_wanted()
+            state = self._drive_to(waypoint)
+            view = self._capture(index, state, writer)
+            writer.write_view(view)
+            with self._lock:
+                self._done.add(index)
+            self._recorded(index)
+            self._note(writer, "view", index=index)
+
+    def _drive_to(self, waypoint: FloatArray) -> ArmState:
+        arm, spec = self._tools.arm, self._spec
+        state = arm.state()
+        raise_unless_movable(state)
+        move = move_to(
+            state,
+            waypoint,
+            self._tools.limits,
+            speed_mps=spec.speed_mps,
+            acceleration_mps2=spec.acceleration_mps2,
+        )
+        with self._lock:
+            self._check_wanted()
+            arm.start_move(move)
+        return wait_settled(arm, timeout_s=spec.settle_timeout_s)
+
+    def _capture(self, index: int, before: ArmState, writer: RecordingWriter) -> View:
+        reasons: list[str] = []
+        for attempt in range(self._spec.retakes + 1):
+            self._check_wanted()
+            image = self._tools.camera.grab(self._spec.grab_timeout_s)
+            after = self._tools.arm.state()
+            shift = moved(
+                before.pose.base_from_tool0, after.pose.base_from_tool0, self._tools.quality
+            )
+            reasons = [*flaws(image, self._tools.quality), *([shift] if shift else [])]
+            if not reasons:
+                return self._view(index, image, after)
+            self._note(writer, "retake", index=index, attempt=attempt, reasons=reasons)
+            before = after
+        raise PictureRefusedError(
+            f"waypoint {index}: {'; '.join(reasons)}; clean the lens, light the tree or move the"
+            " waypoint, then resume"
+        )
+
+    def _view(self, index: int, image: CameraImage, state: ArmState) -> View:
+        return View(
+            index=index,
+            stamp_ns=image.stamp_ns + self._epoch_ns,
+            color_rgb=image.color_rgb,
+            intrinsics=image.intrinsics,
+            base_from_camera=state.pose.base_from_tool0 @ self._tools.tool_from_camera,
+            depth_m=image.depth_m,
+            stereo=image.stereo,
+            instances=image.instances,
+            scores=image.scores,
+        )
+
+    def _check_wanted(self) -> None:
+        if self._wanted is not None:
+            raise ScanInterruptedError(f"{self._wanted} by the operator")
+
+    def _note(self, writer: RecordingWriter, kind: str, **fields: object) -> None:
+        writer.write_event(time.time_ns(), {"kind": kind, **fields})
+        self._report(kind, fields)
+
+    def _end(self, state: ScanState, detail: str) -> None:
+        with self._lock:
+            self._state, self._detail = state, detail
+        self._report(str(state), {"detail": detail} if detail else {})
+
+
+def set_aside(path: Path) -> Path | None:
+    """Put what an earlier session left of a recording aside, to be carried over; None if nothing.
+
+    A file that is aside already was not carried over to the end; it holds all that its copy does.
+    """
+    part, aside = path.with_name(path.name + ".part"), path.with_name(path.name + ".aside")
+    if aside.exists():
+        part.unlink(missing_ok=True)
+    elif part.exists():
+        part.rename(aside)
+    return aside if aside.exists() else None
