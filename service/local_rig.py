@@ -12,7 +12,7 @@ from typing import Protocol
 from canopy_skel.geometry import FloatArray
 from drivers.errors import ArmError, ArmStoppedError, CameraError, DriverError, MoveRefusedError
 from drivers.guarded_arm import Limits
-from drivers.protocols import Arm, Camera, raise_unless_movable
+from drivers.protocols import Arm, ArmMode, Camera, raise_unless_movable
 from drivers.waypoints import after, move_to
 from service.rig import (
     FINISHED,
@@ -239,8 +239,8 @@ class LocalRig:
         session.interrupt(wanted)
         if not session.join(STOP_TIMEOUT_S):
             raise RigNotReadyError(
-                f"the arm was told to stop but the scan has not ended within {STOP_TIMEOUT_S:.0f} s;"
-                " look at the arm, then try again"
+                "the arm was told to stop but the scan has not ended within"
+                f" {STOP_TIMEOUT_S:.0f} s; look at the arm, then try again"
             )
 
     def _session(self, scan_id: str) -> tuple[ScanSpec, ScanSession]:
@@ -283,12 +283,13 @@ class LocalRig:
     def _arm_status(self) -> PartStatus:
         try:
             self._ensure_open("arm")
-            raise_unless_movable(self._parts.arm.state())
+            raise_unless_movable(
+                self._parts.arm.state(), also=(ArmMode.MOVING, ArmMode.INTERRUPTED)
+            )
         except ArmStoppedError as error:
             return PartStatus(name="arm", ready=False, detail=f"{error}; mend it, then acknowledge")
         except ArmError as error:
-            busy = any(s.status.state is ScanState.RUNNING for _, s in self._sessions.values())
-            return PartStatus(name="arm", ready=busy, detail=f"{type(error).__name__}: {error}")
+            return PartStatus(name="arm", ready=False, detail=f"{type(error).__name__}: {error}")
         if self._stopped_reason:
             return PartStatus(
                 name="arm", ready=False, detail=f"{self._stopped_reason}; acknowledge"

@@ -19,7 +19,15 @@ from canopy_skel.geometry import FloatArray
 from canopy_skel.recording import RecordingWriter, carry_over
 from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
-from drivers.protocols import Arm, ArmState, Camera, CameraImage, raise_unless_movable, wait_settled
+from drivers.protocols import (
+    Arm,
+    ArmMode,
+    ArmState,
+    Camera,
+    CameraImage,
+    raise_unless_movable,
+    wait_settled,
+)
 from drivers.quality import QualityLimits, flaws, moved
 from drivers.waypoints import move_to
 from service.rig import ScanSpec, ScanState, ScanStatus
@@ -105,12 +113,12 @@ class ScanSession:
         When this returns, the session begins no further motion. The first stop does not wait for
         the lock, which is held while a move is being begun; the second is for that move.
         """
+        self._wanted = self._wanted or wanted
         self._tools.arm.stop()
         with self._lock:
-            if self._state is not ScanState.RUNNING:
-                return
-            self._wanted = self._wanted or wanted
-        self._tools.arm.stop()
+            under_way = self._state is ScanState.RUNNING
+        if under_way:
+            self._tools.arm.stop()
 
     def conclude(self, state: ScanState) -> None:
         """Set the state of a session that does not run: an operator's decision, or a take-over."""
@@ -169,7 +177,7 @@ class ScanSession:
     def _drive_to(self, waypoint: FloatArray) -> ArmState:
         arm, spec = self._tools.arm, self._spec
         state = arm.state()
-        raise_unless_movable(state)
+        raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
         move = move_to(
             state,
             waypoint,

@@ -1,0 +1,310 @@
+"""Scans through the real ur-rtde client against the fake controller."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from scenes.wood import view_from
+
+from canopy_skel.geometry import invert
+from canopy_skel.pipeline import MethodConfig
+from canopy_skel.recording import read_recording
+from drivers.errors import CameraTimeoutError
+from drivers.guarded_arm import GuardedArm, Limits
+from drivers.protocols import CameraImage
+from drivers.ur5.arm import Ur5Arm
+from drivers.ur5.messages import Ur5Config
+from mock_hw.fake_ur.process import FakeUr, free_host
+from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
+from service.local_rig import LocalRig, RigParts
+from service.rig import (
+    PartStatus,
+    PlanRefusedError,
+    RigBusyError,
+    RigNotReadyError,
+    ScanSpec,
+    ScanState,
+    UnknownScanError,
+)
+
+LIMITS = Limits(box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1))
+WAYPOINTS = tuple(pose @ invert(TOOL_FROM_CAMERA) for pose in camera_path(10))
+pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
+
+
+class StillCamera:
+    """Returns the same sharp picture of the sticks; tests make it fail."""
+
+    def __init__(self):
+        self.view = view_from(0)
+        self.color = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
+        self.spoiled = 0
+        self.hangs = False
+        self.grabs = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *reasons):
+        pass
+
+    def grab(self, timeout_s):
+        self.grabs += 1
+        if self.hangs:
+            raise CameraTimeoutError(f"no picture within {timeout_s} s; check the cable")
+        color = self.color
+        if self.spoiled > 0:
+            self.spoiled -= 1
+            color = np.full((240, 320, 3), 128, np.uint8)
+        return CameraImage(
+            stamp_ns=time.monotonic_ns(),
+            color_rgb=color,
+            intrinsics=self.view.intrinsics,
+            depth_m=self.view.depth_m,
+            instances=self.view.instances,
+            scores=self.view.scores,
+        )
+
+
+class Collected:
+    """A feed that remembers."""
+
+    def __init__(self):
+        self.offered = []
+
+    def begin(self, spec, path):
+        pass
+
+    def offer(self, scan_id, index):
+        self.offered.append(index)
+
+    def skeleton(self, scan_id):
+        return None
+
+    def worker(self):
+        return PartStatus(name="worker", ready=True)
+
+
+@pytest.fixture(scope="module")
+def controller():
+    with FakeUr(free_host(), time_scale=20) as running:
+        yield running
+
+
+@pytest.fixture
+def fake(controller):
+    controller.do("home")
+    yield controller
+    controller.do("reset")
+    time.sleep(0.03)
+
+
+@pytest.fixture
+def camera():
+    return StillCamera()
+
+
+@pytest.fixture
+def rig(fake, camera, tmp_path):
+    arm = GuardedArm(Ur5Arm(Ur5Config(host=fake.host, script_timeout_s=0.5)), LIMITS)
+    parts = RigParts(
+        arm=arm,
+        camera=camera,
+        limits=LIMITS,
+        tool_from_camera=TOOL_FROM_CAMERA,
+        feed=Collected(),
+        data=tmp_path,
+    )
+    with LocalRig(parts) as running:
+        running.events = []
+        running.subscribe(lambda event: running.events.append((event.kind, dict(event.fields))))
+        running.feed = parts.feed
+        yield running
+
+
+def spec(scan_id="scan-1", waypoints=WAYPOINTS[:4], **changes):
+    return ScanSpec(
+        scan_id=scan_id, tree_id="t1", waypoints=waypoints, config=MethodConfig(), **changes
+    )
+
+
+def wait_for(rig, scan_id, *states, timeout_s=30.0):
+    until = time.perf_counter() + timeout_s
+    while rig.status(scan_id).state not in states:
+        assert time.perf_counter() < until, rig.status(scan_id)
+        time.sleep(0.01)
+    return rig.status(scan_id)
+
+
+def wait_until_moving(rig, controller):
+    before = controller.do("state")["joints_rad"]
+    until = time.perf_counter() + 10
+    while np.allclose(controller.do("state")["joints_rad"], before, atol=1e-4):
+        assert time.perf_counter() < until
+
+
+def assert_stands_still(controller):
+    """Once the brakes have done their work, nothing moves."""
+    until = time.perf_counter() + 2
+    while controller.do("state")["moving"]:
+        assert time.perf_counter() < until
+        time.sleep(0.01)
+    joints = controller.do("state")["joints_rad"]
+    time.sleep(0.3)
+    assert controller.do("state")["joints_rad"] == joints
+
+
+def views_of(rig, scan_id):
+    return list(read_recording(rig.recording_path(scan_id)).views())
+
+
+def test_a_scan_visits_its_waypoints_and_records_what_it_saw(rig, fake):
+    status = rig.start(spec())
+    assert (status.state, status.views_total) == (ScanState.RUNNING, 4)
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    recording = read_recording(rig.recording_path("scan-1"))
+    views = list(recording.views())
+    assert [view.index for view in views] == [0, 1, 2, 3]
+    for view, pose in zip(views, camera_path(10), strict=False):
+        np.testing.assert_allclose(view.base_from_camera, pose, atol=2e-4)
+        assert abs(view.stamp_ns - time.time_ns()) < 60e9
+    assert rig.feed.offered == [0, 1, 2, 3]
+    assert [kind for kind, _ in rig.events].count("view") == 4
+    assert rig.events[-1][0] == "done"
+    assert recording.metadata["tree_id"] == "t1"
+
+
+def test_a_paused_scan_stands_still_and_goes_on_where_it_was(rig, fake):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    assert rig.pause("scan-1").state is ScanState.PAUSED
+    done = rig.status("scan-1").views_done
+    assert_stands_still(fake)
+    assert rig.status("scan-1").views_done == done < 4
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    assert [view.index for view in views_of(rig, "scan-1")] == [0, 1, 2, 3]
+    assert sorted(path.name for path in rig.recording_path("scan-1").parent.iterdir()) == [
+        "scan-1.mcap"
+    ]
+
+
+def test_a_cancelled_scan_keeps_its_views_and_does_not_go_on(rig):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    assert rig.cancel("scan-1").state is ScanState.CANCELLED
+    assert len(views_of(rig, "scan-1")) >= 1
+    with pytest.raises(RigNotReadyError, match="is cancelled"):
+        rig.resume("scan-1")
+
+
+def test_a_second_scan_is_refused(rig):
+    rig.start(spec())
+    with pytest.raises(RigBusyError, match="scan scan-1 is under way"):
+        rig.start(spec("scan-2"))
+    wait_for(rig, "scan-1", ScanState.DONE)
+
+
+def test_the_operators_stop_needs_an_acknowledgement(rig, fake):
+    rig.start(spec())
+    wait_until_moving(rig, fake)
+    rig.stop()
+    assert wait_for(rig, "scan-1", ScanState.STOPPED)
+    with pytest.raises(RigNotReadyError, match="acknowledge"):
+        rig.resume("scan-1")
+    with pytest.raises(RigNotReadyError, match="acknowledge"):
+        rig.start(spec("scan-2"))
+    assert_stands_still(fake)
+    rig.acknowledge("looked, nobody near")
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [("protective_stop", "ProtectiveStopError"), ("emergency_stop", "EmergencyStopError")],
+)
+def test_a_safety_stop_in_mid_move_loses_nothing_and_moves_nothing(rig, fake, fault, says):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    wait_until_moving(rig, fake)
+    fake.do(fault)
+    status = wait_for(rig, "scan-1", ScanState.STOPPED)
+    assert says in status.detail
+    with pytest.raises(RigNotReadyError):
+        rig.resume("scan-1")
+    assert_stands_still(fake)
+    assert len(views_of(rig, "scan-1")) == status.views_done >= 1
+
+
+def test_a_hanging_camera_stops_the_scan_and_it_can_go_on(rig, camera):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    camera.hangs = True
+    status = wait_for(rig, "scan-1", ScanState.STOPPED)
+    assert "CameraTimeoutError: no picture within" in status.detail
+    camera.hangs = False
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+
+
+def test_a_bad_picture_is_taken_again(rig, camera):
+    camera.spoiled = 2
+    rig.start(spec(waypoints=WAYPOINTS[:1]))
+    wait_for(rig, "scan-1", ScanState.DONE)
+    assert camera.grabs == 3
+    retakes = [fields for kind, fields in rig.events if kind == "retake"]
+    assert [fields["index"] for fields in retakes] == [0, 0]
+    assert "blurred" in retakes[0]["reasons"][0]
+
+
+def test_a_waypoint_without_a_good_picture_stops_the_scan(rig, camera):
+    camera.spoiled = 99
+    rig.start(spec(waypoints=WAYPOINTS[:1]))
+    status = wait_for(rig, "scan-1", ScanState.STOPPED)
+    assert "waypoint 0: blurred" in status.detail
+    assert "resume" in status.detail
+
+
+def test_unreachable_waypoints_are_refused_before_anything_moves(rig, fake):
+    far = WAYPOINTS[0].copy()
+    far[:3, 3] = (3.0, 0.0, 0.5)
+    joints = fake.do("state")["joints_rad"]
+    with pytest.raises(PlanRefusedError, match="waypoint 1") as refused:
+        rig.start(spec(waypoints=(WAYPOINTS[0], far, WAYPOINTS[1])))
+    assert [verdict.reachable for verdict in refused.value.verdicts] == [True, False, True]
+    assert fake.do("state")["joints_rad"] == joints
+    with pytest.raises(UnknownScanError):
+        rig.status("scan-1")
+
+
+def test_what_a_killed_service_left_is_carried_on(rig, tmp_path):
+    """The recording of an interrupted session is all there is; a new rig adopts the scan."""
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 2:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    before = {v.index: v.depth_m.tobytes() for v in views_of(rig, "scan-1")}
+    rig.adopt(spec())
+    assert rig.status("scan-1").state is ScanState.STOPPED
+    rig.resume("scan-1")
+    wait_for(rig, "scan-1", ScanState.DONE)
+    after = {v.index: v.depth_m.tobytes() for v in views_of(rig, "scan-1")}
+    assert set(after) == {0, 1, 2, 3}
+    assert all(after[index] == data for index, data in before.items())
+
+
+def test_stop_from_another_thread_ends_motion_at_once(rig, fake):
+    rig.start(spec(waypoints=WAYPOINTS))
+    wait_until_moving(rig, fake)
+    stopper = threading.Thread(target=rig.stop)
+    stopper.start()
+    stopper.join(2.0)
+    assert not stopper.is_alive()
+    wait_for(rig, "scan-1", ScanState.STOPPED)
+    assert_stands_still(fake)
