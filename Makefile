@@ -4,14 +4,19 @@ RECORDING ?= recordings/demo_apple.mcap
 VENV := .venv
 BIN := $(VENV)/bin
 VALIDATOR := $(VENV)/gltf_validator
+RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test check bench results departures figures
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt tests/gltf_validator/package-lock.json
+$(RUNS): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	touch $@
+
+$(READY): $(RUNS) tests/gltf_validator/package-lock.json
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	mkdir -p $(VALIDATOR)
 	cp tests/gltf_validator/package.json tests/gltf_validator/package-lock.json $(VALIDATOR)
@@ -19,7 +24,7 @@ $(READY): pyproject.toml constraints.txt tests/gltf_validator/package-lock.json
 		ci --prefix $(VALIDATOR) --no-audit --no-fund --loglevel=error
 	touch $@
 
-demo: $(READY)
+demo: $(RUNS)
 	$(BIN)/canopy replay recordings/demo_apple.mcap -o out --method paper --segmenter recorded
 	@echo "The skeleton: out/demo_apple.skeleton.json, and for viewers out/demo_apple.skeleton.glb"
 	@echo "Its picture:  out/demo_apple.overlay.png"

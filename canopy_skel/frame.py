@@ -89,6 +89,12 @@ class View:
                     f"view {self.index}: {name} is {image.shape[1]}x{image.shape[0]} but the colour"
                     f" calibration says {size[1]}x{size[0]}; align {name} to the colour camera"
                 )
+        for number, score in enumerate(self.scores or (), start=1):
+            if not 0.0 <= score <= 1.0:
+                raise ViewError(
+                    f"view {self.index}: the score of instance {number} is {score}; scores are"
+                    " probabilities, 0 to 1"
+                )
         if not is_rigid(self.base_from_camera):
             raise ViewError(
                 f"view {self.index}: base_from_camera is not a rigid transform (NaN or degenerate"

@@ -55,26 +55,3 @@ def invert(transform: FloatArray) -> FloatArray:
 def transform_points(target_from_source: FloatArray, points_in_source: FloatArray) -> FloatArray:
     """Map (N, 3) points by a (4, 4) transform."""
     return points_in_source @ target_from_source[:3, :3].T + target_from_source[:3, 3]
-
-
-def resample_edges(
-    positions: FloatArray, edges: IntArray, spacing_m: float
-) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Put points at the middle of equal pieces (no longer than `spacing_m`) of every edge.
-
-    Args:
-        positions: (V, 3) metres.
-        edges: (E, 2) vertex indices.
-        spacing_m: longest piece.
-
-    Returns:
-        points (P, 3); the edge each point lies on (P,); the length in metres it stands for (P,).
-    """
-    start, end = positions[edges[:, 0]], positions[edges[:, 1]]
-    length = np.linalg.norm(end - start, axis=1)
-    pieces = np.maximum(np.ceil(length / spacing_m - 1e-9), 1).astype(np.int64)
-    edge_of_point = np.repeat(np.arange(len(edges)), pieces)
-    first = np.repeat(np.cumsum(pieces) - pieces, pieces)
-    along = (np.arange(len(edge_of_point)) - first + 0.5) / pieces[edge_of_point]
-    points = start[edge_of_point] + along[:, None] * (end - start)[edge_of_point]
-    return points, edge_of_point, (length / pieces)[edge_of_point]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial import cKDTree
 
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
@@ -42,27 +41,28 @@ def initial_skeleton(
     segments: Segments, grid: LikelihoodGrid, index: VoxelIndex, config: InitialConfig
 ) -> SkeletonGraph:
     """Sample, smooth, consolidate per voxel and span: the observed skeleton, many components."""
-    samples = sample_segments(segments, grid.voxel_size_m)
+    samples = sample_segments(segments, 0.5 * grid.voxel_size_m)
     smoothed = smooth_across(samples, config)
     vertices, radius_m = consolidate(smoothed, grid.voxel_size_m)
     place = index.find(voxels_of(vertices, grid.voxel_size_m))
-    probability = np.append(grid.probability(), 0.0)
-    edges = spanning_forest(vertices, np.sqrt(3.0) * grid.voxel_size_m)
+    # Smoothing can carry a point out of the map, where nothing says that there is wood.
+    inside = place >= 0
+    vertices, radius_m, place = vertices[inside], radius_m[inside], place[inside]
+    edges = spanning_forest(vertices, grid.voxel_size_m)
     kept, edges = prune_spurs(vertices, edges, config.spur_m)
     return SkeletonGraph(
         vertices_in_base=vertices[kept],
         edges=edges,
         radius_m=radius_m[kept],
         occluded=np.zeros(len(kept), dtype=bool),
-        confidence=probability[place][kept],
+        confidence=grid.probability()[place][kept],
     )
 
 
 def sample_segments(segments: Segments, spacing_m: float) -> Samples:
     """Put points on the segments, both ends included, no further apart than `spacing_m`.
 
-    Exactly the voxel size as spacing would leave edges just above it, and a cut there shatters the
-    skeleton; so the spacing is at most that.
+    With at most half a voxel between them, the voxels they fall into are neighbours of each other.
     """
     direction = segments.ends_in_base - segments.starts_in_base
     length = np.linalg.norm(direction, axis=1)
@@ -122,15 +122,23 @@ def consolidate(samples: Samples, voxel_size_m: float) -> tuple[FloatArray, Floa
     return means[:, :3], means[:, 3]
 
 
-def spanning_forest(points: FloatArray, longest_m: float) -> IntArray:
-    """Return the edges (E, 2) of the Euclidean minimum spanning forest, none above `longest_m`."""
-    if len(points) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = cKDTree(points).query_pairs(longest_m, output_type="ndarray")
-    pairs = pairs[np.lexsort(pairs.T[::-1])]
-    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+def spanning_forest(points: FloatArray, voxel_size_m: float) -> IntArray:
+    """Return the edges (E, 2) of the minimum spanning forest over points in neighbouring voxels.
+
+    One point (V, 3) per voxel. The paper cuts the Euclidean tree at one voxel; with one vertex per
+    voxel that limit means the 26 neighbours, whatever their distance.
+    """
+    voxels = voxels_of(points, voxel_size_m)
+    index = VoxelIndex(voxels)
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    for offset in [o for o in np.ndindex(3, 3, 3) if o > (1, 1, 1)]:
+        beside = index.find((voxels + np.array(offset, dtype=np.int32) - 1).astype(np.int32))
+        here = np.flatnonzero(beside >= 0)
+        pairs.append(np.stack([here, beside[here]], axis=1).astype(np.int64))
+    edges = np.concatenate(pairs)
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     # A weight of exactly 0 would be no edge to the library.
-    weights = coo_array((np.maximum(length, 1e-12), pairs.T), shape=(len(points),) * 2)
+    weights = coo_array((np.maximum(length, 1e-12), edges.T), shape=(len(points),) * 2)
     forest = minimum_spanning_tree(weights.tocsr()).tocoo()
     return np.stack([forest.row, forest.col], axis=1).astype(np.int64)
 

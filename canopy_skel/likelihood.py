@@ -12,8 +12,10 @@ from canopy_skel.kernels import blocks, ellipsoid
 from canopy_skel.spline import BranchSpline
 
 Int32Array = NDArray[np.int32]
-BYTES_PER_VOXEL = 64
+BYTES_PER_VOXEL = 128
 """Sums, rows and what the path search needs per voxel of the map: what the limit counts."""
+THICKEST_VOXEL_M = 0.1
+"""A larger voxel holds several branches: the map could not tell them apart."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -26,9 +28,10 @@ class LikelihoodConfig:
 
     def __post_init__(self) -> None:
         """Check the range once."""
-        if not (np.isfinite(self.voxel_size_m) and self.voxel_size_m > 0):
+        if not 0 < self.voxel_size_m <= THICKEST_VOXEL_M:
             raise UsageError(
-                f"voxel size {self.voxel_size_m} m: give a length above 0, such as 0.005"
+                f"voxel size {self.voxel_size_m} m: give a length above 0 and up to"
+                f" {THICKEST_VOXEL_M}, such as 0.005"
             )
 
 
@@ -108,7 +111,8 @@ class LikelihoodMap:
     """The one mutable object of the method: integer sums of -log(1 - p_o) in 8^3 blocks.
 
     p_l <- 1 - (1 - p_l)(1 - p_o) (paper eq. 2) is a sum of -log(1 - p_o). Integers make it exact:
-    any order of views gives the same bytes. Memory grows with the wood seen, not with the box.
+    any order of views gives the same bytes. Memory grows with the wood seen; of the box around it
+    only a table of 4 bytes per block is kept.
     """
 
     def __init__(self, config: LikelihoodConfig, memory_limit_bytes: int = 3 << 30) -> None:
@@ -131,8 +135,8 @@ class LikelihoodMap:
         if not kept.any():
             return
         lengths, radii = length[kept] / voxel, np.maximum(segments.radius_m[kept] / voxel, 1e-6)
-        self._check_memory(lengths, radii)
         starts = segments.starts_in_base[kept] / voxel
+        self._check_memory(starts, lengths, radii)
         axes = direction[kept] / length[kept, None]
         k = self._config.k
         rows = ellipsoid.rows_of_segments(starts, axes, lengths, radii, k)
@@ -158,12 +162,19 @@ class LikelihoodMap:
             voxel_size_m=self._config.voxel_size_m, voxels=voxels[order], units=units[order]
         )
 
-    def _check_memory(self, lengths: FloatArray, radii: FloatArray) -> None:
+    def _check_memory(self, starts: FloatArray, lengths: FloatArray, radii: FloatArray) -> None:
         k = self._config.k
         support = np.pi * (k * radii + 1) ** 2 * ((2 * k + 1) * lengths + 2)
-        needed = (self._sums.size + float(support.sum())) * BYTES_PER_VOXEL
+        reach = (k + 1) * lengths.max() + k * radii.max()
+        low, high = starts.min(axis=0) - reach, starts.max(axis=0) + reach
+        if self._top.size:
+            low = np.minimum(low, 8.0 * self._origin)
+            high = np.maximum(high, 8.0 * (self._origin + self._top.shape))
+        table = 4.0 * float(np.prod((high - low) / 8.0 + 2.0))
+        needed = (self._sums.size + float(support.sum())) * BYTES_PER_VOXEL + table
         if needed > self._memory_limit_bytes:
-            fits = self._config.voxel_size_m * (2 * needed / self._memory_limit_bytes) ** (1 / 3)
+            # Further views will add to the map: advise with room for four times as much.
+            fits = self._config.voxel_size_m * (4 * needed / self._memory_limit_bytes) ** (1 / 3)
             raise UsageError(
                 f"voxel size {self._config.voxel_size_m} m: the likelihood map would need about"
                 f" {needed / 2**30:.1f} GiB of {self._memory_limit_bytes / 2**30:.1f} GiB;"

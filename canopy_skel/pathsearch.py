@@ -52,7 +52,10 @@ def search_paths(graph: SkeletonGraph, grid: LikelihoodGrid, index: VoxelIndex) 
 def add_paths(
     graph: SkeletonGraph, joins: list[Join], grid: LikelihoodGrid, index: VoxelIndex
 ) -> SkeletonGraph:
-    """Add the paths as occluded vertices at voxel centres; radii are interpolated along a path."""
+    """Add the paths as occluded vertices at voxel centres, as thick as the thinner of their ends.
+
+    Where a twig meets the trunk it is the twig that goes on under the leaves.
+    """
     node = index.find(voxels_of(graph.vertices_in_base, grid.voxel_size_m))
     vertex_of_node = {int(n): v for v, n in reversed(list(enumerate(node))) if n >= 0}
     radius = graph.radius_m.tolist()
@@ -61,9 +64,9 @@ def add_paths(
     for join in joins:
         path = join.nodes.tolist()
         ends = radius[vertex_of_node[path[0]]], radius[vertex_of_node[path[-1]]]
-        for n, r in zip(path[1:-1], np.linspace(*ends, len(path))[1:-1], strict=True):
+        for n in path[1:-1]:
             vertex_of_node[n] = len(radius)
-            radius.append(float(r))
+            radius.append(min(ends))
             added.append(n)
         vertices = [vertex_of_node[n] for n in path]
         edges.extend(pairwise(vertices))

@@ -7,11 +7,14 @@ from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from typing import Literal, get_args
 
+import numpy as np
+
 from canopy_skel.baselines.ftsem import FtsemConfig, join_break_points
 from canopy_skel.baselines.mst import join_by_spanning_tree
 from canopy_skel.cluster import ClusterConfig, RejectedInstance, cluster_branches
-from canopy_skel.errors import UsageError
+from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
+from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
@@ -21,6 +24,10 @@ from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
 
 MethodName = Literal["paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
+LONGEST_WAY_M = 5.0
+"""Between a camera and the nearest other one of a scan."""
+FARTHEST_M = 1e5
+"""From base; beyond, voxels could not be numbered."""
 Stage = Callable[[str], AbstractContextManager[None]]
 
 
@@ -76,6 +83,7 @@ class Skeletonizer:
         self._stage = stage
         self._map = LikelihoodMap(config.likelihood, memory_limit_bytes)
         self._splines: dict[int, list[BranchSpline]] = {}
+        self._cameras: dict[int, FloatArray] = {}
         self._instances = 0
         self._rejected: list[RejectedInstance] = []
 
@@ -110,6 +118,7 @@ class Skeletonizer:
         """
         if view.index in self._splines:
             return len(self._splines[view.index])
+        self._check_place(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
         with self._stage("cluster"):
@@ -119,9 +128,21 @@ class Skeletonizer:
         with self._stage("likelihood"):
             self._map.add(segments_of(splines))
         self._splines[view.index] = splines
+        self._cameras[view.index] = view.base_from_camera[:3, 3]
         self._instances += len(masks)
         self._rejected.extend(rejected)
         return len(splines)
+
+    def _check_place(self, view: View) -> None:
+        """Refuse a view from far away: its pose is wrong, and the map would span the way there."""
+        here = view.base_from_camera[:3, 3]
+        away_m = [float(np.linalg.norm(here - there)) for there in self._cameras.values()]
+        if max(np.abs(here)) > FARTHEST_M or (away_m and min(away_m) > LONGEST_WAY_M):
+            raise ViewError(
+                f"view {view.index}: its camera is at ({here[0]:.1f}, {here[1]:.1f}, {here[2]:.1f})"
+                f" m, more than {LONGEST_WAY_M:.0f} m from all others; check its pose on /tf, which"
+                " must be in metres"
+            )
 
     def skeleton(self) -> Extraction:
         """Return the skeleton of all views so far; it does not depend on their order."""

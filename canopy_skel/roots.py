@@ -10,9 +10,10 @@ _END_M = 0.10
 
 
 def main_root(graph: SkeletonGraph) -> int:
-    """Return the end the tree grows from; z is up.
+    """Return the vertex the tree grows from; z is up.
 
-    Every end scores: its radius over the radius of thick wood here (at most 1), plus its
+    Every end, and every valley, scores: its radius over the radius of thick wood here (at most
+    1), plus its
     component's share of all wood, minus its height, minus its horizontal distance from the
     wood's centre of mass (where the trunk is expected), both over the size of the skeleton. So
     neither a low twig, nor a thick limb cut off high up, nor a weed beside the trunk wins.
@@ -22,7 +23,7 @@ def main_root(graph: SkeletonGraph) -> int:
     thick_m = float(np.percentile(graph.radius_m, 95)) or 1.0
     mass = graph.radius_m**2 if graph.radius_m.any() else np.ones(len(points))
     centre = (mass @ points[:, :2]) / mass.sum()
-    ends = _ends(graph)
+    ends = _starts(graph)
     thickness = np.minimum(_end_radius_m(graph, ends) / thick_m, 1.0)
     height = (points[ends, 2] - points[:, 2].min()) / size_m
     offset = np.linalg.norm(points[ends, :2] - centre, axis=1) / size_m
@@ -47,9 +48,14 @@ def fragment_root(graph: SkeletonGraph, members: IntArray, trunk: FloatArray) ->
     return int(ends[np.argmin(apart_m + 0.5 * points[ends, 2])])
 
 
-def _ends(graph: SkeletonGraph) -> IntArray:
+def _starts(graph: SkeletonGraph) -> IntArray:
+    """Return ends, and valleys: where two stems meet lowest, the trunk below was not seen."""
     degree = np.bincount(graph.edges.ravel(), minlength=len(graph.vertices_in_base))
-    return np.flatnonzero(degree <= 1)
+    z = graph.vertices_in_base[:, 2]
+    lowest_beside = np.full(len(z), np.inf)
+    for here, there in (graph.edges.T, graph.edges.T[::-1]):
+        np.minimum.at(lowest_beside, here, z[there])
+    return np.flatnonzero((degree <= 1) | (lowest_beside > z))
 
 
 def _share(graph: SkeletonGraph) -> FloatArray:
@@ -76,5 +82,6 @@ def _end_radius_m(graph: SkeletonGraph, ends: IntArray) -> FloatArray:
             came, here = path[-1], onward[0]
             path.append(here)
             onward = [v for v in neighbours[here] if v != came]
-        radii.append(float(np.median(graph.radius_m[path])))
+        beside = neighbours[end] if len(neighbours[end]) > 1 else []
+        radii.append(float(np.median(graph.radius_m[[*path, *beside]])))
     return np.array(radii)

@@ -37,6 +37,7 @@ app = typer.Typer(
     add_completion=False,
 )
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+MOST_MAP_MEMORY = 3 << 30
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 Out = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
 
@@ -82,7 +83,7 @@ def replay(
         segmenter=segmenter,
         formats=tuple(formats.split(",")),
         topics=topic_options(topic or []),
-        memory_limit_bytes=available_memory_bytes() // 2,
+        memory_limit_bytes=min(available_memory_bytes() // 2, MOST_MAP_MEMORY),
     )
     _require_distinct_stems(recordings)
     require_writable(output)
@@ -111,7 +112,8 @@ def _replay_one(
         _complain(error)
         results.append({"recording": str(path), "error": str(error)})
         return Exit.FAILED
-    for line in (*result.warnings, *(v.reason for v in result.document.views_rejected)):
+    rejected = (f"{path.name}: {view.reason}" for view in result.document.views_rejected)
+    for line in (*result.warnings, *rejected):
         stderr.print(f"warning: {line}", style="yellow", markup=False)
     results.append(_replayed(path, result))
     if not quiet:
@@ -187,9 +189,15 @@ def recover(
     if as_json:
         typer.echo(json.dumps(jsonable(report), indent=2))
     else:
-        typer.echo(f"{target}: {report.views_saved} whole views saved")
+        typer.echo(
+            f"{target}: {report.views_saved} whole views saved, {report.bytes_lost} bytes lost"
+        )
+    for index in report.views_incomplete:
+        stderr.print(f"warning: {source}: of view {index} only a part is left", style="yellow")
     for line in report.damage:
         stderr.print(f"warning: {line}", style="yellow", markup=False)
+    if report.damage:
+        raise typer.Exit(Exit.PARTIAL)
 
 
 @app.command()

@@ -6,12 +6,13 @@ import shutil
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+
+from packaging.requirements import Requirement
 
 from canopy_skel import kernels
 
-PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "mcap", "protobuf")
 ENOUGH_MEMORY = 2 << 30
 ENOUGH_DISK = 1 << 30
 
@@ -33,10 +34,18 @@ def examine() -> list[Finding]:
     """Look at everything canopy needs."""
     return [
         _python(),
-        *(_package(name) for name in PACKAGES),
+        *(_package(name) for name in needed_packages()),
         _memory(),
         _disk(Path.cwd()),
         _kernel_cache(),
+    ]
+
+
+def needed_packages() -> list[str]:
+    """Return the names of the packages canopy is declared to need here."""
+    declared = [Requirement(line) for line in requires("canopy-skel") or []]
+    return [
+        one.name for one in declared if one.marker is None or one.marker.evaluate({"extra": ""})
     ]
 
 

@@ -90,8 +90,16 @@ def replay(
         contents = _files(path.stem, document, walk, request)
     summary = _summary(recording, document, walk, extraction, stopwatch)
     contents[f"{path.stem}.summary.json"] = json.dumps(summary, indent=2).encode() + b"\n"
+    warnings = list(recording.warnings)
+    if not document.branches:
+        reasons = Counter(instance.reason for instance in walk.skeletonizer.rejected)
+        why = ", ".join(f"{count} x {reason}" for reason, count in reasons.most_common())
+        warnings.append(
+            f"{path.name}: no branch was found in {walk.skeletonizer.instances} instances"
+            f" ({why or 'there are none'}); check masks and depth with `canopy inspect`"
+        )
     return ReplayResult(
-        files=tuple(write_all(out, contents)), document=document, warnings=recording.warnings
+        files=tuple(write_all(out, contents)), document=document, warnings=tuple(warnings)
     )
 
 

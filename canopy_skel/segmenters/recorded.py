@@ -1,6 +1,5 @@
 """Masks that came with the recording, from anybody's network or from a simulation."""
 
-import math
 from collections.abc import Sequence
 
 from scipy.ndimage import find_objects
@@ -14,7 +13,7 @@ class RecordedSegmenter:
     """Hands on the instances recorded on `/camera/branches/*`."""
 
     def segment(self, view: View) -> Sequence[BranchMask]:
-        """Return the recorded instances that have pixels.
+        """Return the recorded instances that have pixels and a score above 0.
 
         Raises:
             ViewError: instances or scores are missing, or do not belong together.
@@ -31,15 +30,9 @@ class RecordedSegmenter:
                 f"view {view.index}: /camera/branches/instances holds instance {highest} but"
                 f" /camera/branches/scores has {len(view.scores)} scores; write one score for each"
             )
-        for number, score in enumerate(view.scores, start=1):
-            if not (math.isfinite(score) and 0.0 < score <= 1.0):
-                raise ViewError(
-                    f"view {view.index}: score {score} of instance {number} on"
-                    " /camera/branches/scores is not in (0, 1]"
-                )
         masks = []
         for number, box in enumerate(find_objects(view.instances), start=1):
-            if box is not None:
+            if box is not None and view.scores[number - 1] > 0.0:
                 masks.append(
                     BranchMask(
                         instance=number,

@@ -104,18 +104,32 @@ def test_the_order_of_segments_does_not_matter_to_the_bit(seed):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60))
-def test_the_forest_is_the_euclidean_one_without_long_edges(seed, count):
-    points = np.random.default_rng(seed).uniform(0, 0.05, (count, 3))
-    edges = spanning_forest(points, 0.012)
+def test_the_forest_is_the_euclidean_one_over_neighbouring_voxels(seed, count):
+    random = np.random.default_rng(seed)
+    voxels = np.unique(random.integers(-4, 4, (count, 3)), axis=0).reshape(-1, 3)
+    points = (voxels + random.uniform(0.01, 0.99, voxels.shape)) * VOXEL
+    edges = spanning_forest(points, VOXEL)
     everything = nx.Graph()
-    everything.add_nodes_from(range(count))
-    for a in range(count):
+    everything.add_nodes_from(range(len(points)))
+    for a in range(len(points)):
         for b in range(a):
-            gap = float(np.linalg.norm(points[a] - points[b]))
-            if gap <= 0.012:
+            if np.abs(voxels[a] - voxels[b]).max() <= 1:
+                gap = float(np.linalg.norm(points[a] - points[b]))
                 everything.add_edge(a, b, weight=gap)
     expected = nx.minimum_spanning_tree(everything)
     assert {tuple(sorted(e)) for e in edges.tolist()} == {tuple(sorted(e)) for e in expected.edges}
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_straight_piece_of_wood_stays_one_piece(seed):
+    random = np.random.default_rng(seed)
+    direction = random.normal(size=3)
+    if seed % 4 == 0:
+        direction = np.sign(direction)  # through the corners of voxels
+    start = random.uniform(-0.1, 0.1, 3) * (seed % 3 > 0)
+    end = start + 0.3 * direction / np.linalg.norm(direction)
+    graph = skeleton_of(segments_from([start], [end]))
+    assert graph.components()[0] == 1
 
 
 def test_one_vertex_per_voxel_inside_it():
@@ -142,7 +156,9 @@ def test_spurs_go_and_twigs_stay():
 def test_pruning_keeps_components_and_leaves_no_short_spur(seed, count):
     random = np.random.default_rng(seed)
     points = random.uniform(0, 0.08, (count, 3))
-    edges = spanning_forest(points, 0.03)
+    points = points[np.unique(np.floor(points / 0.02), axis=0, return_index=True)[1]]
+    count = len(points)
+    edges = spanning_forest(points, 0.02)
     kept, remaining = prune_spurs(points, edges, 0.02)
     before, after = nx.Graph(edges.tolist()), nx.Graph(remaining.tolist())
     before.add_nodes_from(range(count))

@@ -106,7 +106,7 @@ def test_certain_masks_stay_finite():
     assert grid.units.min() > 0
 
 
-@pytest.mark.parametrize("voxel", [0.0, -0.005, float("nan"), float("inf")])
+@pytest.mark.parametrize("voxel", [0.0, -0.005, 0.5, float("nan"), float("inf")])
 def test_a_voxel_size_must_be_a_length(voxel):
     with pytest.raises(UsageError, match="voxel size"):
         LikelihoodConfig(voxel_size_m=voxel)

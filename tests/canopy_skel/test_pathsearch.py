@@ -107,6 +107,13 @@ def test_a_saturated_map_does_not_make_paths_wander():
     assert len(joins[0].nodes) == 40
 
 
+def test_a_very_costly_way_is_still_a_way():
+    units = {(x, 0, 0): 1 for x in range(1000)}
+    _, joins, _, _ = search(units, [[(0, 0, 0)], [(999, 0, 0)]])
+    assert len(joins[0].nodes) == 1000
+    assert joins[0].cost_nat > 10_000
+
+
 def test_no_way_no_join():
     units = {(x, 0, 0): 50_000 for x in range(10) if x != 5}
     _, joins, _, _ = search(units, [[(0, 0, 0)], [(9, 0, 0)]])

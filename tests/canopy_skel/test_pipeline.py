@@ -116,6 +116,22 @@ def test_a_view_that_cannot_be_used_costs_the_others_nothing(views):
     assert bytes_of(maker) == bytes_of(alone)
 
 
+def test_a_view_from_far_away_is_refused_before_it_stretches_the_map(views):
+    maker = skeletonizer()
+    maker.add_view(views[0])
+    far = np.array(views[1].base_from_camera)
+    far[:3, 3] *= 1000
+    far[0, 3] += 100
+    with pytest.raises(ViewError, match=r"view 1: its camera is at .* check its pose on /tf"):
+        maker.add_view(view_from(1, base_from_camera=far))
+    assert maker.views == (0,)
+
+
+def test_a_mask_without_confidence_counts_for_nothing(views):
+    maker = skeletonizer()
+    assert maker.add_view(view_from(0, scores=(0.9, 0.0, 0.9))) == 2
+
+
 def test_an_unknown_method_names_the_known_ones():
     with pytest.raises(UsageError, match="unknown method 'best': choose one of paper, mst, ftsem"):
         MethodConfig(name="best")

@@ -5,12 +5,12 @@ import math
 from itertools import combinations, product
 
 STEP_LENGTH = (0, 5, 7, 9)
-UNITS_PER_NAT = 1 << 36
+UNITS_PER_NAT = 1 << 24
 OFFSETS = [o for o in product((-1, 0, 1), repeat=3) if any(o)]
 
 
 def weight(q, u, v):
-    """(cost in 2^-36 nat, length): compared in this order, as the fast search does."""
+    """(cost in 2^-24 nat, length): compared in this order, as the fast search does."""
     cost = round(-math.log1p(-0.5 * (q[u] + q[v])) * UNITS_PER_NAT)
     return cost, STEP_LENGTH[sum(abs(a - b) for a, b in zip(u, v, strict=True))]
 

@@ -163,6 +163,15 @@ def test_a_bad_view_is_left_out_and_said(canopy, tmp_path):
     assert [view.index for view in document.views_rejected] == [1]
 
 
+def test_a_recording_without_any_branch_says_why_it_found_none(canopy, tmp_path):
+    path = tmp_path / "blind.mcap"
+    far = np.full((240, 320), 50.0, np.float32)
+    write(path, [view_from(0, depth_m=far)])
+    code, _, stderr = canopy("replay", path, "-o", tmp_path / "out")
+    assert code == 3
+    assert "no branch was found in 3 instances (3 x too few points" in stderr
+
+
 def test_no_usable_view_is_a_failure_and_writes_nothing(canopy, tmp_path):
     path = tmp_path / "none.mcap"
     write(path, [view_from(0, scores=None, instances=None)])
