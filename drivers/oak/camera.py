@@ -75,6 +75,11 @@ class OakCamera:
         finally:
             self._grabbing.release()
 
+    @property
+    def pid(self) -> int | None:
+        """Return the process id of the present child."""
+        return self._process.pid if self._process else None
+
     def grab(self, timeout_s: float) -> CameraImage:
         """Return a picture no part of which was exposed before this call; see `Camera.grab`.
 
