@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canopy_skel.frame import Intrinsics, StereoPair
-from canopy_skel.pixels import as_depth_m, as_mono, as_rgb
+from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt16Array
+from canopy_skel.pixels import as_mono, as_rgb
 from drivers.protocols import CameraImage
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Exposure:
         eye = self.frames["color" if "color" in self.frames else "left"]
         # depthai hands out colour as OpenCV does, blue first.
         pixels = np.array(eye.getCvFrame())
-        depth_m = as_depth_m(np.array(self.frames["depth"].getFrame()))
+        depth_m = _metres(np.asarray(self.frames["depth"].getFrame(), dtype=np.uint16))
         if depth_m.shape != pixels.shape[:2]:
             raise ValueError(
                 f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} but colour is {pixels.shape[1]}x"
@@ -84,6 +84,11 @@ def intrinsics_of(frame: "dai.ImgFrame") -> Intrinsics:
     return Intrinsics(
         fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, width_px=width_px, height_px=height_px
     )
+
+
+def _metres(millimetres: UInt16Array) -> Float32Array:
+    """Return depth in metres, NaN = no return; nothing near enough to see is no error here."""
+    return np.where(millimetres > 0, millimetres * np.float32(1e-3), np.float32(np.nan))
 
 
 def _ns(since_start: timedelta) -> int:

@@ -158,20 +158,22 @@ def test_a_child_that_dies_at_once_is_said(behaviour, make_camera):
 # Against depthai: there is no device here, but there is the library.
 
 
-def test_without_a_device_it_says_so_within_a_second():
-    pytest.importorskip("depthai", reason="needs the extra: pip install 'canopy-skel[oak]'")
+@pytest.fixture
+def dai():
+    return pytest.importorskip("depthai", reason="needs the extra: pip install 'canopy-skel[oak]'")
+
+
+def test_without_a_device_it_says_so_within_a_second(dai):
+    """Half of that second is depthai's search; a busy machine gets a few tries."""
+    if dai.Device.getAllAvailableDevices():
+        pytest.skip("there is an OAK here")
     took_s = []
-    for _ in range(4):
+    while not took_s or (min(took_s) > 1.0 and len(took_s) < 6):
         started = time.perf_counter()
-        try:
-            with OakCamera():
-                pytest.skip("there is an OAK here")
-        except NoCameraError as error:
-            assert "no OAK camera found" in str(error)
+        with pytest.raises(NoCameraError, match="no OAK camera found"), OakCamera():
+            pass
         took_s.append(time.perf_counter() - started)
-        if took_s[-1] < 1.0:
-            return
-    pytest.fail(f"took {min(took_s):.2f} s at best")
+    assert min(took_s) < 1.0
 
 
 def test_without_depthai_it_says_how_to_get_it(tmp_path, monkeypatch):
@@ -194,11 +196,6 @@ def test_with_several_devices_one_must_be_named(tmp_path, monkeypatch, name, say
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(NoCameraError, match=says), OakCamera(OakConfig(device=name)):
         pass
-
-
-@pytest.fixture
-def dai():
-    return pytest.importorskip("depthai", reason="needs the extra: pip install 'canopy-skel[oak]'")
 
 
 def frame(dai, pixels, kind, at_s, matrix=None):
@@ -253,6 +250,19 @@ def test_frames_of_the_stereo_cameras_become_a_picture_with_its_pair(dai):
     assert image.stereo.right_mono[5, 5] == 71
     assert image.stereo.intrinsics == image.intrinsics
     assert image.stereo.baseline_m == 0.075
+
+
+def test_a_covered_lens_gives_a_picture_without_depth(dai):
+    exposure = Exposure(
+        frames={
+            "color": frame(
+                dai, np.zeros((40, 64, 3), np.uint8), dai.ImgFrame.Type.RGB888i, 1.0, MATRIX
+            ),
+            "depth": frame(dai, np.zeros((40, 64), np.uint16), dai.ImgFrame.Type.RAW16, 1.0),
+        },
+        baseline_m=0.075,
+    )
+    assert np.isnan(exposure.image().depth_m).all()
 
 
 def test_depth_of_another_size_or_a_device_without_calibration_is_refused(dai):
