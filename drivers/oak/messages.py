@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class OakConfig:
     """One OAK-D and what it shall deliver.
 
-    device: id or address as `canopy doctor` or depthai names it; empty: the only one there is.
+    device: id or address; empty: the only one there is.
     eye: whose picture is the colour picture. "color": the colour camera, depth aligned to it.
     "left": the left of the stereo cameras, rectified, with the right one beside it (`stereo`).
     width_px, height_px: of the colour picture; the stereo cameras run at `stereo_size_px`.

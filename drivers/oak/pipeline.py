@@ -1,7 +1,7 @@
 """The depthai graph: what the device computes, and one group of frames per exposure."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import timedelta
 
 import depthai as dai
@@ -24,9 +24,8 @@ def running(config: OakConfig, info: dai.DeviceInfo) -> Iterator[Callable[[], Ex
     Raises:
         RuntimeError: the device cannot be opened, or (from what was yielded) is lost.
     """
-    device = dai.Device(info)
-    baseline_m = _CM * device.readCalibration().getBaselineDistance(_RIGHT, _LEFT, False)
-    with dai.Pipeline(device) as pipeline:
+    with closing(dai.Device(info)) as device, dai.Pipeline(device) as pipeline:
+        baseline_m = _CM * device.readCalibration().getBaselineDistance(_RIGHT, _LEFT, False)
         sync = pipeline.create(dai.node.Sync)
         sync.setSyncThreshold(timedelta(seconds=0.5 / config.frames_per_s))
         for name, output in _outputs(pipeline, config).items():
@@ -35,7 +34,10 @@ def running(config: OakConfig, info: dai.DeviceInfo) -> Iterator[Callable[[], Ex
         pipeline.start()
 
         def newest() -> Exposure | None:
-            group = queue.tryGet()
+            try:
+                group = queue.tryGet()
+            except dai.MessageQueue.QueueException as error:
+                raise RuntimeError("the device was lost: check cable and power") from error
             if not isinstance(group, dai.MessageGroup):
                 return None
             frames = {name: frame for name, frame in group if isinstance(frame, dai.ImgFrame)}

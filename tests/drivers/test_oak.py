@@ -20,6 +20,7 @@ from drivers.oak.messages import OakConfig
 
 QUICK = OakConfig(open_timeout_s=10.0, silence_s=0.5)
 CHILD = Path(__file__).parent / "fake_oak_child.py"
+STAGED = CHILD.with_name("oak_child_on_stage.py")
 
 
 @pytest.fixture
@@ -50,6 +51,53 @@ class TestOakCamera(CameraContract, FailingOpenContract):
             behaviour.write_text("well")
 
         return gone
+
+
+@pytest.fixture
+def on_stage(behaviour):
+    """The real child and the real depthai, but for the device."""
+    pytest.importorskip("depthai", reason="needs the extra: pip install 'canopy-skel[oak]'")
+    command = (sys.executable, str(STAGED), str(behaviour))
+    return lambda eye: OakCamera(OakConfig(eye=eye), command)
+
+
+def test_the_color_camera_comes_without_a_pair(on_stage):
+    with on_stage("color") as camera:
+        called_ns = time.monotonic_ns()
+        image = camera.grab(5.0)
+    assert image.stereo is None
+    assert image.stamp_ns >= called_ns
+    assert image.depth_m == pytest.approx(0.1)
+    assert image.intrinsics.fx_px == 80.0
+
+
+class TestOakChildOnStage(CameraContract):
+    @pytest.fixture
+    def make_camera(self, on_stage):
+        return lambda: on_stage("left")
+
+    @pytest.fixture
+    def make_blind_camera(self, behaviour, make_camera):
+        behaviour.write_text("dark")
+        return make_camera
+
+    def test_the_left_eye_has_the_right_one_beside_it(self, camera):
+        pair = camera.grab(5.0).stereo
+        assert pair.baseline_m == pytest.approx(0.075)
+        assert pair.intrinsics.fx_px == 80.0
+
+    def test_a_device_that_is_lost_is_opened_again(self, behaviour, camera):
+        camera.grab(5.0)
+        pid = camera.pid
+        behaviour.write_text("lost-once")
+        camera.grab(10.0)
+        assert camera.pid != pid
+
+    def test_a_device_that_stays_away_is_named(self, behaviour, camera):
+        behaviour.write_text("lost")
+        time.sleep(0.1)
+        with pytest.raises(NoCameraError, match="the device was lost: check cable and power"):
+            camera.grab(0.2)
 
 
 @pytest.mark.hardware

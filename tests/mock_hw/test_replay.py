@@ -131,7 +131,10 @@ def test_the_stereo_pair_comes_back_too(shared_recording):
 def test_a_place_off_the_track_is_refused_and_the_nearest_view_named(demo):
     pose = demo.stations[1].base_from_tool0.copy()
     pose[0, 3] += 0.02
-    with ReplayArm(demo) as arm, pytest.raises(UnreachableError, match=r"is view \d, 0\.020 m away"):
+    with (
+        ReplayArm(demo) as arm,
+        pytest.raises(UnreachableError, match=r"is view \d, 0\.020 m away"),
+    ):
         arm.start_move(linear(pose))
 
 

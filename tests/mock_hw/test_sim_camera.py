@@ -7,12 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from contracts.arm import down, linear
 from contracts.camera import CameraContract
 
+from canopy_skel.document import to_json
 from canopy_skel.errors import UsageError
 from canopy_skel.geometry import invert
 from drivers.errors import CameraTimeoutError
-from drivers.protocols import ToolPose
+from drivers.protocols import ToolPose, wait_settled
+from drivers.ur5.arm import Ur5Arm
+from drivers.ur5.messages import Ur5Config
 from mock_hw.orchard.path import OAK_D, TOOL_FROM_CAMERA
 from mock_hw.orchard.simulate import Options, prepare, truth, views
 from mock_hw.sim_camera import SimCamera
@@ -105,7 +109,7 @@ def test_truth_counts_only_the_pictures_that_were_kept(exact):
         one_view = camera.truth()
         flange.base_from_tool0 = tool_at(exact.true_poses[7])
         camera.grab(10.0)
-    assert camera.truth({first.stamp_ns}).to_json() == one_view.to_json()
+    assert to_json(camera.truth({first.stamp_ns})) == to_json(one_view)
     assert camera.truth().occluded.sum() < one_view.occluded.sum()
     assert camera.truth().views_used == 2
 
@@ -162,6 +166,21 @@ def test_others_can_run_while_it_draws(flange, simulation):
             longest_s, last_s = max(longest_s, now_s - last_s), now_s
         drawing.join()
     assert longest_s < 0.25
+
+
+def test_on_the_arm_it_sees_from_where_the_controller_says(fake, exact):
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
+    fake.do("home")
+    with (
+        Ur5Arm(Ur5Config(host=fake.host, script_timeout_s=0.5)) as arm,
+        SimCamera(lambda: arm.state().pose, exact, scale=SCALE) as camera,
+    ):
+        for _ in range(3):
+            arm.start_move(linear(down(arm.state(), 0.1)))
+            state = wait_settled(arm, timeout_s=10.0)
+            camera.grab(10.0)
+            expected = state.pose.base_from_tool0 @ TOOL_FROM_CAMERA
+            assert camera.exposures[-1].base_from_camera == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_smaller_picture_shows_the_same(flange, exact):
