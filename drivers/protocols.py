@@ -180,7 +180,8 @@ class CameraImage:
 
     stamp_ns: the middle of the exposure on the host clock (`time.monotonic_ns`). color_rgb:
     (H, W, 3) uint8. depth_m: (H, W) float32 aligned to colour, NaN = no return. instances,
-    scores: branch masks of cameras that know them (simulated, replayed), as in `View`.
+    scores: branch masks of cameras that know them (simulated, replayed), as in `View`. All arrays
+    are read-only.
     """
 
     stamp_ns: int
@@ -190,6 +191,14 @@ class CameraImage:
     stereo: StereoPair | None = None
     instances: UInt16Array | None = None
     scores: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Let nobody change what was seen."""
+        pair = self.stereo
+        sides = (None, None) if pair is None else (pair.left_mono, pair.right_mono)
+        for array in (self.color_rgb, self.depth_m, self.instances, *sides):
+            if array is not None:
+                array.setflags(write=False)
 
 
 class Camera(Protocol):
@@ -213,6 +222,7 @@ class Camera(Protocol):
 
         Raises:
             CameraTimeoutError: none came within `timeout_s`.
+            NoCameraError: not inside the `with` block, or the camera is gone.
         """
         ...
 

@@ -110,6 +110,21 @@ class Recording:
                 f"{self.path}: none of {len(self.groups)} views is usable; the first: {first}"
             )
 
+    def view(self, index: int) -> View | RejectedView:
+        """Return the view with this index alone; see `views`.
+
+        Raises:
+            RecordingError: there is no such view, or the file has changed since it was looked
+                through.
+        """
+        for group in self.groups:
+            if group.index == index:
+                try:
+                    return self._decode(group, MessageReader(self.file), decoders_of(self.file))
+                except ViewError as error:
+                    return RejectedView(index=index, reason=str(error))
+        raise RecordingError(f"{self.path}: no view {index}; it has {self.view_count} views")
+
     def _decode(self, group: Group, reader: MessageReader, decoders: Mapping[str, Decoder]) -> View:
         if group.flaw is not None:
             raise ViewError(group.flaw)

@@ -141,7 +141,7 @@ def views(simulation: Simulation) -> Iterator[View]:
     """Yield the views of the scan as the method gets them: noisy depth, reported poses."""
     for index, pose in enumerate(simulation.true_poses):
         view = render_view(
-            _scene_at(simulation, index),
+            scene_at(simulation, index),
             pose,
             simulation.options.camera,
             index=index,
@@ -156,7 +156,7 @@ def truth(simulation: Simulation) -> SkeletonDocument:
     intrinsics, tree = simulation.options.camera.intrinsics, simulation.scene.tree
     seen = nothing_seen(tree)
     for index, pose in enumerate(simulation.true_poses):
-        scene = _scene_at(simulation, index)
+        scene = scene_at(simulation, index)
         picture = renderer.draw(scene.mesh, pose, intrinsics)
         seen = seen_also(seen, picture.vertex, fragments_in(scene, picture, pose, intrinsics))
     return truth_document(
@@ -172,7 +172,7 @@ def _rng(options: Options, purpose: int) -> np.random.Generator:
     return np.random.default_rng([options.seed, options.topology, 5, purpose])
 
 
-def _scene_at(simulation: Simulation, index: int) -> Scene:
+def scene_at(simulation: Simulation, index: int) -> Scene:
     """Return the scene as the wind has it at view `index`."""
     scene, reach = simulation.scene, simulation.options.wind_m
     if reach == 0:

@@ -1,5 +1,6 @@
 """The true skeleton as a document, with what the scan could and could not see."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,17 @@ def seen_also(seen: Seen, vertex: Int32Array, fragments: Fragments) -> Seen:
     segmented = seen.segmented.copy()
     segmented[fragments.vertex[fragments.detectable[fragments.fragment]]] = True
     return Seen(pixels=np.maximum(seen.pixels, pixels), segmented=segmented)
+
+
+def seen_together(parts: Iterable[Seen], tree: Tree) -> Seen:
+    """Join what several sets of views saw."""
+    whole = nothing_seen(tree)
+    for part in parts:
+        whole = Seen(
+            pixels=np.maximum(whole.pixels, part.pixels),
+            segmented=whole.segmented | part.segmented,
+        )
+    return whole
 
 
 def truth_document(

@@ -15,7 +15,7 @@ def _root(parent: I32, i: int) -> int:
     return i
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def components(label: I32, out: I32) -> int:
     """Number the 8-connected regions of equal label >= 0 in reading order; return their count.
 

@@ -43,7 +43,7 @@ def _w_at(corners: Corners, inverse_area: float, u: int, v: int) -> float:
     return a * wa + b * wb + c * wc
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def draw(screen: F64, triangles: I32, w_buffer: F64, id_buffer: I32) -> None:
     """Draw all triangles; the nearest wins, at equal depth the first.
 
@@ -66,7 +66,7 @@ def draw(screen: F64, triangles: I32, w_buffer: F64, id_buffer: I32) -> None:
                     id_buffer[v, u] = t
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def first_cover(screen: F64, triangles: I32, per_leaf: int, w_buffer: F64, cover: I32) -> None:
     """Write to each pixel the first leaf in front of what `w_buffer` (H, W) holds.
 

@@ -249,7 +249,7 @@ def _alike(surfaces: Surfaces, a: int, b: int) -> bool:
     return a == b or (surfaces.kind[a] == surfaces.kind[b] and surfaces.tone[a] == surfaces.tone[b])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def shade(
     surfaces: Surfaces,
     lights: Lights,

@@ -1,0 +1,1 @@
+"""OAK-D cameras through depthai, which lives in a process of its own."""
