@@ -81,6 +81,8 @@ def decode_envelope(data: bytes) -> ViewEnvelope:
         raise BusError(f"view envelope: its header has no {error}") from error
     except (TypeError, ValueError, UsageError) as error:
         raise BusError(f"view envelope: its header is wrong: {error}") from error
+    if any(one.sequence != envelope.view for one in envelope.messages):
+        raise BusError(f"view envelope: not all its messages are of view {envelope.view}")
     if envelope.config.sha256() != expected:
         raise BusError(
             "view envelope: the method's settings do not match their hash; run service and worker"
