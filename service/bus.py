@@ -103,7 +103,9 @@ def scan_id_of(key: str) -> str:
 
 
 @contextmanager
-def open_session(*, listen: str | None = None, connect: str | None = None) -> Iterator[zenoh.Session]:
+def open_session(
+    *, listen: str | None = None, connect: str | None = None
+) -> Iterator[zenoh.Session]:
     """Open a session that listens on one endpoint, or connects to one; nothing is scouted for.
 
     A session that connects may be opened first: it goes on trying until somebody listens, and again
@@ -111,7 +113,8 @@ def open_session(*, listen: str | None = None, connect: str | None = None) -> It
     itself: zenoh's own close can wait for a dead peer for many seconds.
 
     Args:
-        listen, connect: endpoints on the loopback, such as "tcp/127.0.0.1:7447".
+        listen: endpoint on the loopback to listen on, such as "tcp/127.0.0.1:7447".
+        connect: endpoint on the loopback where another session listens.
 
     Raises:
         UsageError: an endpoint is not on the loopback.
@@ -124,7 +127,9 @@ def open_session(*, listen: str | None = None, connect: str | None = None) -> It
         session = zenoh.open(config)
     except zenoh.ZError as error:
         where = listen or connect
-        raise BusError(f"{where}: the bus cannot be opened ({error}); choose a free port") from error
+        raise BusError(
+            f"{where}: the bus cannot be opened ({error}); choose a free port"
+        ) from error
     try:
         yield session
     finally:

@@ -118,7 +118,9 @@ def _messages(rows: list[list[Any]], body: bytes) -> tuple[Message, ...]:
     for topic, stamp_ns, sequence, size in rows:
         end = start + _typed(size, int)
         if not start <= end <= len(body):
-            raise BusError(f"view envelope: cut off, {topic} would end at byte {end} of {len(body)}")
+            raise BusError(
+                f"view envelope: cut off, {topic} would end at byte {end} of {len(body)}"
+            )
         messages.append(
             Message(
                 topic=_typed(topic, str),

@@ -58,7 +58,7 @@ class _Offered:
 
     def patience_s(self) -> float:
         """How long to wait before trying again."""
-        return min(_PATIENCE_S * 2**self.tries, _MAX_PATIENCE_S)
+        return min(_PATIENCE_S * 2.0**self.tries, _MAX_PATIENCE_S)
 
 
 class ViewFeeder:
@@ -175,7 +175,11 @@ class ViewFeeder:
         """Return a scan of whose skeleton an idle worker has a newer version."""
         for beat in (one.heartbeat for one in workers):
             order = (beat.revision, len(beat.rejected))
-            if not beat.busy and beat.revision and order > self._skeletons.version(beat.scan_id).order:
+            if (
+                not beat.busy
+                and beat.revision
+                and order > self._skeletons.version(beat.scan_id).order
+            ):
                 return beat.scan_id
         return None
 

@@ -47,9 +47,7 @@ class SkeletonCache:
 
     def fetch(self, scan_id: str) -> None:
         """Ask the workers for a document that may have been missed; it comes as if published."""
-        self._session.get(
-            self._keys.skeleton(scan_id), self._take_reply, timeout=_QUERY_TIMEOUT_S
-        )
+        self._session.get(self._keys.skeleton(scan_id), self._take_reply, timeout=_QUERY_TIMEOUT_S)
 
     def _take_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:

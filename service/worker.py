@@ -14,6 +14,7 @@ import queue
 import signal
 import sys
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -50,6 +51,7 @@ class Worker:
         self._lock = threading.Lock()  # of the documents: queries read them
         self._heartbeat = Heartbeat(id=worker_id, pid=os.getpid())
         self._in_hand = False
+        self._patient_until_s = 0.0
         self._progress = 0
         self._stop = threading.Event()
 
@@ -98,7 +100,7 @@ class Worker:
             data = self._inbox.get()
             self._in_hand = True
             self._guarded(lambda data=data: self._take(data))  # type: ignore[misc]
-            if self._inbox.empty():
+            if self._inbox.empty() or time.monotonic() >= self._patient_until_s:
                 self._guarded(self._publish)
             self._in_hand = False
             self._say()
@@ -159,7 +161,11 @@ class Worker:
         self._say()
 
     def _publish(self) -> None:
-        """Publish the skeleton of every scan that has grown since its last one."""
+        """Publish the skeleton of every scan that has grown since its last one.
+
+        While views are waiting, at most half of the time goes into skeletons.
+        """
+        start_s = time.monotonic()
         for scan_id, scan in self._scans.items():
             version = Version(revision=len(scan.views), rejected=len(scan.rejected))
             known, _ = self._documents.get(scan_id, (Version(), b""))
@@ -175,6 +181,7 @@ class Worker:
                 attachment=version.encode(),
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
+        self._patient_until_s = 2 * time.monotonic() - start_s
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:

@@ -94,7 +94,8 @@ class WorkerWatch:
             moving = before is None or not beat.busy or beat.progress != before.heartbeat.progress
             self._last = self._seen[beat.id, beat.pid] = WorkerSeen(
                 heartbeat=beat,
-                first_s=now_s if before is None or now_s - before.last_s > STALE_S
+                first_s=now_s
+                if before is None or now_s - before.last_s > STALE_S
                 else before.first_s,
                 last_s=now_s,
                 moved_s=now_s if before is None or moving else before.moved_s,

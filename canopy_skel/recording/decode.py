@@ -66,9 +66,7 @@ def decode_view(
     return _Exposure(index, parts, transforms, options, decoders).view()
 
 
-def view_from_messages(
-    messages: Sequence[Message], options: TopicOptions = _CANOPY_TOPICS
-) -> View:
+def view_from_messages(messages: Sequence[Message], options: TopicOptions = _CANOPY_TOPICS) -> View:
     """Return the view that the messages of one exposure hold, without the rest of the recording.
 
     It is the View that `read_recording` gives for these messages, as long as they carry their own

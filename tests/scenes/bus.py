@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +51,8 @@ class Rig:
     site_and_rig = ("--site", "orchard", "--rig", "arm-1")
     keys = Keys(site="orchard", rig="arm-1")
 
-    def __init__(self, folder):
+    def __init__(self, folder, session=lambda session: session):
+        self._wrap = session
         self.folder = folder
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.documents = []
@@ -61,7 +62,9 @@ class Rig:
     def __enter__(self):
         self.session = self._stack.enter_context(open_session(listen=self.endpoint))
         self.feeder = self._stack.enter_context(
-            ViewFeeder(self.session, self.keys, lambda *found: self.documents.append(found))
+            ViewFeeder(
+                self._wrap(self.session), self.keys, lambda *found: self.documents.append(found)
+            )
         )
         return self
 
@@ -119,7 +122,20 @@ class Rig:
         return (out / f"{name}.skeleton.json").read_bytes()
 
 
-def pause(process, seconds):
-    os.kill(process.pid, signal.SIGSTOP)
-    time.sleep(seconds)
-    os.kill(process.pid, signal.SIGCONT)
+def listening_addresses(pid):
+    """Return address and port of every socket on which a process waits for others."""
+    mine = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(OSError):
+            mine.add(os.readlink(link))
+    found = []
+    for protocol in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
+            local, state, inode = (line.split()[i] for i in (1, 3, 9))
+            waits = state == "0A" if protocol.startswith("tcp") else state == "07"
+            if waits and f"socket:[{inode}]" in mine:
+                address, port = local.split(":")
+                octets = bytes.fromhex(address)[::-1]
+                name = ".".join(map(str, octets)) if len(octets) == 4 else address
+                found.append((name, int(port, 16)))
+    return found
