@@ -127,8 +127,13 @@ class ViewFeeder:
         Args:
             index: of the view.
             messages: what RecordingWriter.write_view returned, to spare reading it again.
+
+        Raises:
+            UsageError: no scan was begun.
         """
         with self._changed:
+            if self._source is None:
+                raise UsageError(f"view {index} is of no scan; begin one first")
             held = sum(bool(one.messages) for one in self._offered.values())
             kept = tuple(messages) if held < IN_FLIGHT else ()
             self._offered.setdefault(index, _Offered(messages=kept))
@@ -138,6 +143,10 @@ class ViewFeeder:
         """Wait until every offered view has arrived and its skeleton is here; say whether so."""
         with self._changed:
             return self._changed.wait_for(self._complete, timeout_s)
+
+    def workers(self) -> tuple[WorkerSeen, ...]:
+        """Return the workers that are there now, as they last reported."""
+        return self._watch.workers()
 
     def worker_status(self) -> PartStatus:
         """Return whether a worker is there and gets on."""

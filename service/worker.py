@@ -210,8 +210,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    _on_signals(lambda: _leave(0))  # nothing to close yet, and compiling kernels takes its time
     try:
         keys = Keys(site=options.site, rig=options.rig)
         keys.worker(options.id)
@@ -219,12 +218,18 @@ def main(arguments: Sequence[str]) -> NoReturn:
             open_session(connect=options.connect) as session,
             Worker(session, keys, options.id).running(),
         ):
+            _on_signals(stop.set)
             _log.info("worker %s is ready at %s", options.id, options.connect)
             while not stop.wait(PERIOD_S) and options.parent in (None, os.getppid()):
                 pass
     except CanopyError as error:
         _leave(2, f"error: {error}\n")
     _leave(0)
+
+
+def _on_signals(leave: Callable[[], None]) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: leave())
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -38,7 +38,7 @@ def record(rig, writer, views):
 
 def arrived(rig):
     """How many views the workers have used or rejected."""
-    seen = rig.feeder._watch.workers()
+    seen = rig.feeder.workers()
     return max((len(one.heartbeat.views) + len(one.heartbeat.rejected) for one in seen), default=0)
 
 
