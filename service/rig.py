@@ -11,7 +11,7 @@ from canopy_skel.pipeline import MethodConfig
 
 
 class ScanState(StrEnum):
-    """Where a scan is. STOPPED: motion was dropped and an operator must acknowledge, then resume."""
+    """Where a scan is. STOPPED: motion was dropped; an operator must acknowledge, then resume."""
 
     RUNNING = "running"
     PAUSED = "paused"
@@ -127,7 +127,7 @@ class Rig(Protocol):
         ...
 
     def resume(self, scan_id: str) -> ScanStatus:
-        """Go on at the first waypoint that is missing. Raises UnknownScanError, RigNotReadyError."""
+        """Go on at the first missing waypoint. Raises UnknownScanError, RigNotReadyError."""
         ...
 
     def cancel(self, scan_id: str) -> ScanStatus:
@@ -151,7 +151,7 @@ class Rig(Protocol):
         ...
 
     def recording_path(self, scan_id: str) -> Path:
-        """Return where the scan's recording is (`.part` while it grows). Raises UnknownScanError."""
+        """Return where the recording is (`.part` while it grows). Raises UnknownScanError."""
         ...
 
     def skeleton(self, scan_id: str) -> bytes | None:
