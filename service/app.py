@@ -21,8 +21,6 @@ from service.pictures import Pictures
 from service.rig import Rig
 from service.scans import Scans
 
-LARGEST_BODY = 1 << 20
-
 
 def create_app(
     rig: Rig,
@@ -54,7 +52,6 @@ def create_app(
         responses=RESPONSES,
         docs_url=None,
         redoc_url=None,
-        max_body_size=LARGEST_BODY,
     )
     app.state.context = Context(
         rig=rig,

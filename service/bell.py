@@ -37,9 +37,9 @@ class Bell:
         self._next = asyncio.Event()
 
 
-async def wait_for_ring(ring: asyncio.Event, timeout_s: float) -> None:
-    """Return when it rang, or after `timeout_s`."""
+async def wait_for_ring(ring: asyncio.Event, timeout_s: float) -> bool:
+    """Return true when it rings, false after `timeout_s` of silence."""
     try:
-        await asyncio.wait_for(ring.wait(), timeout_s)
+        return await asyncio.wait_for(ring.wait(), timeout_s)
     except TimeoutError:
-        return
+        return False

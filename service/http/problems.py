@@ -1,6 +1,7 @@
 """Every error as an RFC 9457 problem document."""
 
 import logging
+import re
 from collections.abc import Mapping
 from http import HTTPStatus
 from secrets import token_hex
@@ -11,6 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from canopy_skel.errors import UsageError
 from service.http.requests import UnknownPathError
@@ -20,6 +22,7 @@ from service.scans import KeyReusedError, ScanOverError
 logger = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
+LARGEST_BODY = 1 << 20
 
 # exception -> status, code, title
 _KNOWN: Mapping[type[Exception], tuple[int, str, str]] = {
@@ -81,7 +84,7 @@ def add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(Problem, _problem)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _of_framework)
-    app.add_exception_handler(Exception, _unexpected)
+    app.add_middleware(LastResort, largest_body=LARGEST_BODY)
 
 
 def answer(request: Request, problem: Problem) -> JSONResponse:
@@ -138,20 +141,61 @@ def _of_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)  # noqa: S101  # registered for nothing else
     title = HTTPStatus(error.status_code).phrase
     detail = f"{request.method} {request.url.path}: {error.detail}; see /openapi.json"
-    code = title.lower().replace(" ", "_").replace("-", "_")
+    code = re.sub(r"\W+", "_", title.lower())
     return answer(request, Problem(error.status_code, code, title, detail, headers=error.headers))
 
 
-def _unexpected(request: Request, error: Exception) -> JSONResponse:
+class LastResort:
+    """Answers what no handler sees: bodies that are too long, and errors nobody foresaw.
+
+    The handlers of the framework would answer the first as plain text, and close the connection
+    after the second.
+    """
+
+    def __init__(self, app: ASGIApp, largest_body: int) -> None:
+        self._app = app
+        self._largest_body = largest_body
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = False
+
+        async def watched_send(message: Message) -> None:
+            nonlocal started
+            started = started or message["type"] == "http.response.start"
+            await send(message)
+
+        request = Request(scope)
+        try:
+            self._check_size(request)
+            await self._app(scope, receive, watched_send)
+        except Exception as error:
+            if started:
+                raise
+            problem = error if isinstance(error, Problem) else _unexpected(error)
+            await answer(request, problem)(scope, receive, send)
+
+    def _check_size(self, request: Request) -> None:
+        if "transfer-encoding" in request.headers:
+            title = HTTPStatus(411).phrase
+            raise Problem(411, "length_required", title, "send the body with a Content-Length")
+        length = request.headers.get("content-length", "0")
+        if length.isdecimal() and int(length) > self._largest_body:
+            title = HTTPStatus(413).phrase
+            detail = f"the body has {length} bytes; send at most {self._largest_body}"
+            raise Problem(413, "content_too_large", title, detail)
+
+
+def _unexpected(error: Exception) -> Problem:
     trace_id = token_hex(8)
     logger.error("unexpected error trace_id=%s", trace_id, exc_info=error)
-    return answer(
-        request,
-        Problem(
-            500,
-            "internal_error",
-            "Something went wrong in the service",
-            f"the service's log tells more under trace_id={trace_id}",
-            more={"trace_id": trace_id},
-        ),
+    return Problem(
+        500,
+        "internal_error",
+        "Something went wrong in the service",
+        f"the service's log tells more under trace_id={trace_id}",
+        more={"trace_id": trace_id},
     )

@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.bell import wait_for_ring
-from service.catalogue import ScanRecord
+from service.catalogue import EventRecord, ScanRecord
 from service.http.context import Context, Here, refuse_foreign_pages
 from service.http.problems import Problem
 from service.http.requests import ScanBody, scan_spec
@@ -21,6 +21,8 @@ from service.scans import status_fields
 
 router = APIRouter(prefix="/v1/scans", tags=["scans"])
 _LOOK_AGAIN_S = 5.0
+# A rig says that a scan has ended before it tells the events that led there.
+_LAST_WORDS_S = 0.3
 _COMMAND = [Depends(refuse_foreign_pages)]
 
 
@@ -110,21 +112,20 @@ async def follow_scan(
     last_event_id: Annotated[int, Header(ge=0)] = 0,
 ) -> AsyncIterator[ServerSentEvent]:
     """Stream what happened and happens, after event `Last-Event-ID`; ends with the scan (`end`)."""
-    seq = last_event_id
+    seq, silent = last_event_id, False
     while not here.bell.closed:
         ring = here.bell.next_ring()
         over, events = await run_in_threadpool(_news, here, scan_id, seq)
         for event in events:
             seq = event.seq
             yield ServerSentEvent(id=str(seq), event=event.kind, data=event.data)
-        if over:
+        if over and silent and not events:
             yield ServerSentEvent(event="end", data={})
             return
-        await wait_for_ring(ring, _LOOK_AGAIN_S)
+        silent = not await wait_for_ring(ring, _LAST_WORDS_S if over else _LOOK_AGAIN_S)
 
 
-def _news(here: Context, scan_id: str, seq: int) -> tuple[bool, list[Any]]:
-    """Return whether the scan is over, looked up before its events so that none is missed."""
+def _news(here: Context, scan_id: str, seq: int) -> tuple[bool, list[EventRecord]]:
     over = here.scans.record(scan_id).state in FINISHED
     return over, here.scans.catalogue.events(scan_id, seq)
 

@@ -1,5 +1,6 @@
 """A service on a free port, in this process, and documents for it to serve."""
 
+import json
 import socket
 import threading
 import time
@@ -85,3 +86,15 @@ def skeleton(scan_id: str, revision: int, length_m: float = 1.0) -> bytes:
             views_used=revision,
         )
     )
+
+
+def read_events(stream: httpx2.Response) -> Iterator[dict]:
+    """Yield the events of an SSE stream as {"event", "id", "data"}."""
+    fields: dict = {}
+    for line in stream.iter_lines():
+        name, _, value = line.partition(": ")
+        if not line and fields:
+            yield fields
+            fields = {}
+        elif name:
+            fields[name] = json.loads(value) if name == "data" else value
