@@ -1,0 +1,326 @@
+"""The catalogue: which scans there were, what happened in them, which skeletons came out.
+
+SQLite beside the recordings; skeleton documents are files, written before the row that names them.
+One process owns a catalogue at a time. Every method may be called from any thread.
+"""
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
+from sqlalchemy.engine.interfaces import DBAPIConnection
+
+from canopy_skel.errors import UsageError
+from service.outputs import require_writable
+from service.rig import FINISHED, ScanState, ScanStatus
+from service.tables import EVENTS, IDEMPOTENCY, REVISIONS, SCANS
+
+KEY_LIFETIME_NS = 24 * 3600 * 10**9
+INTERRUPTED = (
+    "the service ended during this scan; look at the arm, acknowledge, then resume or cancel"
+)
+_BUSY_TIMEOUT_MS = 5000
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanRecord:
+    """A scan as the catalogue knows it. request: see `service.specs.fields_of`."""
+
+    scan_id: str
+    tree_id: str
+    state: ScanState
+    request: Mapping[str, Any]
+    views_done: int
+    views_total: int
+    detail: str
+    recording: Path | None
+    created_ns: int
+    updated_ns: int
+
+    @property
+    def status(self) -> ScanStatus:
+        """The part of it that a rig reports."""
+        return ScanStatus(**{name: getattr(self, name) for name in ScanStatus.__slots__})
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EventRecord:
+    """An event of a scan; seq counts from 1."""
+
+    seq: int
+    kind: str
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RevisionRecord:
+    """A skeleton document: its revision number, the hash of its bytes, the file."""
+
+    revision: int
+    sha256: str
+    path: Path
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class UsedKey:
+    """What an idempotency key was used for."""
+
+    body_sha256: str
+    scan_id: str
+    response: Mapping[str, Any] | None
+
+
+class Catalogue:
+    """Entering opens (and where needed makes or migrates) the catalogue in `folder`."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self._folder = Path(folder)
+        self._blobs = self._folder / "skeletons"
+
+    def __enter__(self) -> Self:
+        """Take the folder for this process and bring the schema up to date.
+
+        Raises:
+            UsageError: another process has it open, or it cannot be written.
+        """
+        require_writable(self._blobs)
+        self._lock = _locked(self._folder / "catalogue.lock")
+        self._engine = sa.create_engine(f"sqlite:///{self._folder / 'catalogue.sqlite'}")
+        sa.event.listen(self._engine, "connect", _set_pragmas)
+        with self._engine.begin() as connection:
+            config = Config()
+            config.set_main_option("script_location", "service:migrations")
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close every connection and give the folder free."""
+        self._engine.dispose()
+        os.close(self._lock)
+
+    def transaction(self) -> AbstractContextManager[sa.Connection]:
+        """Return a connection whose changes are all kept, or none if the block raises."""
+        return self._engine.begin()
+
+    def recover(self) -> list[str]:
+        """Put right what a killed service left; return the scans that were under way then.
+
+        They become STOPPED: their motion is over, and only an operator may have it go on.
+        """
+        under_way = SCANS.c.state.in_([ScanState.RUNNING, ScanState.PAUSED])
+        with self.transaction() as connection:
+            left = connection.scalars(sa.select(SCANS.c.scan_id).where(under_way)).all()
+            connection.execute(
+                SCANS.update()
+                .where(under_way)
+                .values(state=ScanState.STOPPED, detail=INTERRUPTED, updated_ns=time.time_ns())
+            )
+            named = set()
+            for row in connection.execute(sa.select(REVISIONS)).all():
+                if (self._folder / row.path).exists():
+                    named.add(self._folder / row.path)
+                else:
+                    connection.execute(
+                        REVISIONS.delete().where(_is_revision(row.scan_id, row.revision))
+                    )
+        for file in set(self._blobs.iterdir()) - named:
+            file.unlink()
+        return list(left)
+
+    def add_scan(
+        self, status: ScanStatus, request: Mapping[str, Any], key: str, body_sha256: str
+    ) -> None:
+        """Note a scan that is about to start, together with the key that asked for it."""
+        now_ns = time.time_ns()
+        with self.transaction() as connection:
+            connection.execute(
+                IDEMPOTENCY.delete().where(IDEMPOTENCY.c.created_ns < now_ns - KEY_LIFETIME_NS)
+            )
+            connection.execute(
+                SCANS.insert().values(
+                    **_status_values(status), request=request, created_ns=now_ns, updated_ns=now_ns
+                )
+            )
+            connection.execute(
+                IDEMPOTENCY.insert().values(
+                    key=key, body_sha256=body_sha256, scan_id=status.scan_id, created_ns=now_ns
+                )
+            )
+
+    def drop_scan(self, scan_id: str) -> None:
+        """Forget a scan that was refused, and the key that asked for it."""
+        with self.transaction() as connection:
+            connection.execute(SCANS.delete().where(SCANS.c.scan_id == scan_id))
+
+    def used_key(self, key: str) -> UsedKey | None:
+        """Return what the key was used for within the last 24 hours, None if for nothing."""
+        fresh = IDEMPOTENCY.c.created_ns >= time.time_ns() - KEY_LIFETIME_NS
+        with self.transaction() as connection:
+            query = sa.select(IDEMPOTENCY).where(IDEMPOTENCY.c.key == key, fresh)
+            row = connection.execute(query).one_or_none()
+        if row is None:
+            return None
+        return UsedKey(body_sha256=row.body_sha256, scan_id=row.scan_id, response=row.response)
+
+    def keep_response(self, key: str, response: Mapping[str, Any]) -> None:
+        """Keep the answer that a repeated request with this key gets."""
+        with self.transaction() as connection:
+            connection.execute(
+                IDEMPOTENCY.update().where(IDEMPOTENCY.c.key == key).values(response=response)
+            )
+
+    def update(self, status: ScanStatus, recording: Path | None = None) -> bool:
+        """Note where a scan is now; say whether the catalogue has it."""
+        values = _status_values(status) | {"updated_ns": time.time_ns()}
+        if recording is not None:
+            values["recording"] = str(recording)
+        with self.transaction() as connection:
+            statement = SCANS.update().where(SCANS.c.scan_id == status.scan_id).values(values)
+            return connection.execute(statement).rowcount == 1
+
+    def scan(self, scan_id: str) -> ScanRecord | None:
+        """Return a scan, None if there is none of this id."""
+        with self.transaction() as connection:
+            query = sa.select(SCANS).where(SCANS.c.scan_id == scan_id)
+            row = connection.execute(query).one_or_none()
+        return None if row is None else _scan_record(row)
+
+    def scans(self, limit: int, before: str | None = None) -> list[ScanRecord]:
+        """Return up to `limit` scans, newest first; only older ones than scan `before`."""
+        place = sa.tuple_(SCANS.c.created_ns, SCANS.c.scan_id)
+        query = sa.select(SCANS).order_by(SCANS.c.created_ns.desc(), SCANS.c.scan_id.desc())
+        if before is not None:
+            mark = sa.select(SCANS.c.created_ns, SCANS.c.scan_id).where(SCANS.c.scan_id == before)
+            query = query.where(place < mark.scalar_subquery())
+        with self.transaction() as connection:
+            return [_scan_record(row) for row in connection.execute(query.limit(limit))]
+
+    def unfinished(self) -> list[ScanRecord]:
+        """Return the scans that can still go on, newest first."""
+        query = sa.select(SCANS).where(SCANS.c.state.not_in(FINISHED))
+        with self.transaction() as connection:
+            rows = connection.execute(query.order_by(SCANS.c.created_ns.desc()))
+            return [_scan_record(row) for row in rows]
+
+    def add_event(self, scan_id: str, kind: str, data: Mapping[str, Any]) -> None:
+        """Append an event to a scan's."""
+        last = sa.select(sa.func.coalesce(sa.func.max(EVENTS.c.seq), 0) + 1).where(
+            EVENTS.c.scan_id == scan_id
+        )
+        with self.transaction() as connection:
+            connection.execute(
+                EVENTS.insert().values(
+                    scan_id=scan_id, seq=last.scalar_subquery(), kind=kind, data=data
+                )
+            )
+
+    def events(self, scan_id: str, after: int) -> list[EventRecord]:
+        """Return the events of a scan with seq above `after`, in order."""
+        query = sa.select(EVENTS).where(EVENTS.c.scan_id == scan_id, EVENTS.c.seq > after)
+        with self.transaction() as connection:
+            rows = connection.execute(query.order_by(EVENTS.c.seq))
+            return [EventRecord(seq=row.seq, kind=row.kind, data=row.data) for row in rows]
+
+    def add_revision(self, scan_id: str, content: bytes) -> bool:
+        """Keep a skeleton document and say whether it is news.
+
+        Revisions never go back: one older than the newest is ignored, so all but the newest are
+        final.
+        """
+        digest = sha256(content).hexdigest()
+        newest = self.newest_revision(scan_id)
+        if newest and digest == newest.sha256:
+            return False
+        revision = json.loads(content)["revision"]
+        if newest and revision < newest.revision:
+            return False
+        path = self._blobs / f"{digest}.json"
+        _write_durably(path, content)
+        values = {"sha256": digest, "path": str(path.relative_to(self._folder))}
+        place = {"scan_id": scan_id, "revision": revision}
+        with self.transaction() as connection:
+            connection.execute(REVISIONS.delete().where(_is_revision(scan_id, revision)))
+            connection.execute(REVISIONS.insert().values(place | values))
+        return True
+
+    def newest_revision(self, scan_id: str) -> RevisionRecord | None:
+        """Return the newest skeleton revision of a scan, None while there is none."""
+        query = sa.select(REVISIONS).where(REVISIONS.c.scan_id == scan_id)
+        return self._revision(query.order_by(REVISIONS.c.revision.desc()).limit(1))
+
+    def revision(self, scan_id: str, revision: int) -> RevisionRecord | None:
+        """Return one skeleton revision of a scan, None if it is not there."""
+        return self._revision(sa.select(REVISIONS).where(_is_revision(scan_id, revision)))
+
+    def _revision(self, query: sa.Select[Any]) -> RevisionRecord | None:
+        with self.transaction() as connection:
+            row = connection.execute(query).one_or_none()
+        if row is None:
+            return None
+        path = self._folder / row.path
+        return RevisionRecord(revision=row.revision, sha256=row.sha256, path=path)
+
+
+def _locked(path: Path) -> int:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        raise UsageError(
+            f"{path.parent}: another canopy service uses this folder; end it or name another one"
+        ) from error
+    return descriptor
+
+
+def _set_pragmas(connection: DBAPIConnection, record: object) -> None:
+    cursor = connection.cursor()
+    for pragma in (
+        "journal_mode=WAL",
+        "synchronous=NORMAL",
+        "foreign_keys=ON",
+        f"busy_timeout={_BUSY_TIMEOUT_MS}",
+    ):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _write_durably(path: Path, content: bytes) -> None:
+    part = path.with_suffix(".part")
+    with part.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(path)
+
+
+def _is_revision(scan_id: str, revision: int) -> sa.ColumnElement[bool]:
+    return sa.and_(REVISIONS.c.scan_id == scan_id, REVISIONS.c.revision == revision)
+
+
+def _status_values(status: ScanStatus) -> dict[str, Any]:
+    return {name: getattr(status, name) for name in ScanStatus.__slots__}
+
+
+def _scan_record(row: sa.Row[Any]) -> ScanRecord:
+    fields = dict(row._mapping)  # noqa: SLF001  # SQLAlchemy's public name for it
+    recording = fields.pop("recording")
+    fields["state"] = ScanState(fields["state"])
+    return ScanRecord(**fields, recording=Path(recording) if recording else None)

@@ -1,0 +1,45 @@
+"""What the routes work with, and the checks they share."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from fastapi import Depends, Request
+from numpy.typing import ArrayLike
+
+from service.bell import Bell
+from service.http.problems import Problem
+from service.http.requests import SpeedCaps
+from service.pictures import Pictures
+from service.rig import Rig
+from service.scans import Scans
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Context:
+    """Everything behind the routes."""
+
+    rig: Rig
+    scans: Scans
+    bell: Bell
+    pictures: Pictures
+    paths: Mapping[str, Sequence[ArrayLike]]
+    caps: SpeedCaps
+
+
+def _context(request: Request) -> Context:
+    context: Context = request.app.state.context
+    return context
+
+
+Here = Annotated[Context, Depends(_context)]
+
+
+def refuse_foreign_pages(request: Request) -> None:
+    """Refuse what a web page of another site makes a browser send: it must not move the arm."""
+    origin = request.headers.get("origin")
+    if origin is not None and urlsplit(origin).netloc != request.headers.get("host"):
+        raise Problem(
+            403, "foreign_origin", "Not from this page", f"{origin} may not command this rig"
+        )

@@ -1,0 +1,147 @@
+"""What callers may ask for: the bodies of requests, and the ScanSpec each stands for."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from secrets import token_hex
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from canopy_skel.geometry import FloatArray, rotation_from_quaternion, transform_from
+from canopy_skel.pipeline import MethodConfig, MethodName
+from service.rig import PlanRefusedError, ScanSpec
+from service.specs import method_config
+
+MOST_WAYPOINTS = 1000
+_UNIT_TOLERANCE = 0.01
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SpeedCaps:
+    """The fastest that may be asked for, of the flange."""
+
+    speed_mps: float = 0.25
+    acceleration_mps2: float = 0.5
+
+
+class UnknownPathError(ValueError):
+    """No path of this name; the message lists those there are."""
+
+
+class Body(BaseModel):
+    """Base of all bodies: a misspelt name is an error, never ignored."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Waypoint(Body):
+    """A pose of the flange (tool0) in base."""
+
+    position: Annotated[tuple[Finite, Finite, Finite], Field(description="metres")]
+    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite]
+
+    @field_validator("quaternion_xyzw")
+    @classmethod
+    def _has_unit_length(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        length = float(np.linalg.norm(value))
+        if abs(length - 1) > _UNIT_TOLERANCE:
+            raise ValueError(f"has length {length:.4g}; give a unit quaternion (x, y, z, w)")
+        return value
+
+    def base_from_tool0(self) -> FloatArray:
+        """Return the pose as (4, 4)."""
+        return transform_from(rotation_from_quaternion(self.quaternion_xyzw), self.position)
+
+
+class PlanBody(Body):
+    """Where to go: a path by name, or waypoints in order; one of both."""
+
+    path: Annotated[str | None, Field(description="see `paths` of GET /v1/rig")] = None
+    waypoints: Annotated[list[Waypoint] | None, Field(min_length=1, max_length=MOST_WAYPOINTS)] = (
+        None
+    )
+    speed_mps: Annotated[
+        Positive | None, Field(description="of the flange; default 0.25 m/s or the cap")
+    ] = None
+    acceleration_mps2: Positive | None = None
+
+    @model_validator(mode="after")
+    def _has_one_of_both(self) -> Self:
+        if (self.path is None) == (self.waypoints is None):
+            raise ValueError("give either path or waypoints")
+        return self
+
+
+class ScanBody(PlanBody):
+    """What to scan and how."""
+
+    tree_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    method: MethodName = "paper"
+    voxel_size_m: Annotated[float, Field(ge=0.001, le=0.05, allow_inf_nan=False)] = 0.005
+    retakes: Annotated[int, Field(ge=0, le=10)] = 2
+
+
+class AcknowledgeBody(Body):
+    """Why it is safe to move again."""
+
+    reason: Annotated[str, Field(min_length=3, max_length=500, pattern=r"\S")]
+
+
+def plan_spec(
+    body: PlanBody, paths: Mapping[str, Sequence[ArrayLike]], caps: SpeedCaps
+) -> ScanSpec:
+    """Return the motion a body asks for, under a new scan id and of no particular tree.
+
+    Raises:
+        UnknownPathError: there is no path of this name.
+        PlanRefusedError: a speed is over its cap.
+    """
+    usual = SpeedCaps()
+    return ScanSpec(
+        scan_id=f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{token_hex(4)}",
+        tree_id="",
+        waypoints=_waypoints(body, paths),
+        config=MethodConfig(),
+        speed_mps=_capped("speed_mps", body.speed_mps, caps.speed_mps, usual.speed_mps),
+        acceleration_mps2=_capped(
+            "acceleration_mps2",
+            body.acceleration_mps2,
+            caps.acceleration_mps2,
+            usual.acceleration_mps2,
+        ),
+    )
+
+
+def scan_spec(
+    body: ScanBody, paths: Mapping[str, Sequence[ArrayLike]], caps: SpeedCaps
+) -> ScanSpec:
+    """Return the scan a body asks for, under a new scan id. Raises as `plan_spec`."""
+    return replace(
+        plan_spec(body, paths, caps),
+        tree_id=body.tree_id,
+        config=method_config(body.method, body.voxel_size_m),
+        retakes=body.retakes,
+    )
+
+
+def _waypoints(body: PlanBody, paths: Mapping[str, Sequence[ArrayLike]]) -> tuple[FloatArray, ...]:
+    if body.waypoints is not None:
+        return tuple(waypoint.base_from_tool0() for waypoint in body.waypoints)
+    if body.path is None or body.path not in paths:
+        known = ", ".join(sorted(paths)) or "none"
+        raise UnknownPathError(f"there is no path {body.path!r}; choose one of: {known}")
+    return tuple(np.array(pose, dtype=np.float64) for pose in paths[body.path])
+
+
+def _capped(name: str, asked: float | None, cap: float, default: float) -> float:
+    if asked is None:
+        return min(cap, default)
+    if asked > cap:
+        raise PlanRefusedError(f"{name} {asked:g} is over the cap of {cap:g}; ask for less")
+    return asked

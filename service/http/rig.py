@@ -1,0 +1,80 @@
+"""Routes of the rig: is it ready, stop it, let it move again, what could it drive."""
+
+from typing import Any
+
+from fastapi import APIRouter, Depends
+
+from service.http.context import Here, refuse_foreign_pages
+from service.http.problems import Problem
+from service.http.requests import AcknowledgeBody, PlanBody, plan_spec
+from service.rig import PartStatus
+from service.scans import status_fields
+
+router = APIRouter(tags=["rig"])
+OPTIONAL_PARTS = frozenset({"worker"})
+
+
+@router.get("/healthz")
+def healthz() -> dict[str, str]:
+    """Say that the process answers."""
+    return {"status": "ok"}
+
+
+@router.get("/readyz")
+def readyz(here: Here) -> dict[str, Any]:
+    """Say whether a scan could start now; a missing worker only leaves skeletons pending."""
+    parts = here.rig.parts()
+    missing = [part for part in parts if not part.ready and part.name not in OPTIONAL_PARTS]
+    if missing:
+        detail = "; ".join(f"{part.name}: {part.detail}" for part in missing)
+        raise Problem(503, "not_ready", "Not ready", detail, more={"parts": _fields(parts)})
+    return {"ready": True, "parts": _fields(parts)}
+
+
+@router.get("/v1/rig")
+def show_rig(here: Here) -> dict[str, Any]:
+    """Tell the state of every part, the scan that can still go on, and what may be asked for."""
+    active = here.scans.active()
+    return {
+        "parts": _fields(here.rig.parts()),
+        "scan": active and status_fields(active),
+        "paths": {name: len(path) for name, path in sorted(here.paths.items())},
+        "caps": {
+            "speed_mps": here.caps.speed_mps,
+            "acceleration_mps2": here.caps.acceleration_mps2,
+        },
+    }
+
+
+@router.post("/v1/rig:stop")
+def stop(here: Here) -> dict[str, str]:
+    """Stop the arm now; no condition, never queued, harmless when repeated."""
+    here.rig.stop()
+    return {"status": "stopped"}
+
+
+@router.post("/v1/rig:acknowledge", dependencies=[Depends(refuse_foreign_pages)])
+def acknowledge(body: AcknowledgeBody, here: Here) -> dict[str, str]:
+    """Let the arm move again after a stop: an operator has looked and says why it is safe."""
+    here.rig.acknowledge(body.reason)
+    return {"status": "acknowledged"}
+
+
+@router.post("/v1/plans", dependencies=[Depends(refuse_foreign_pages)])
+def plan(body: PlanBody, here: Here) -> dict[str, Any]:
+    """Tell for every waypoint whether the arm can drive there; nothing moves."""
+    verdicts = here.rig.plan(plan_spec(body, here.paths, here.caps))
+    waypoints = [{"index": v.index, "reachable": v.reachable, "reason": v.reason} for v in verdicts]
+    return {"feasible": all(v.reachable for v in verdicts), "waypoints": waypoints}
+
+
+def _fields(parts: list[PartStatus]) -> list[dict[str, Any]]:
+    return [
+        {"name": part.name, "ready": part.ready, "detail": part.detail or _fallback(part)}
+        for part in parts
+    ]
+
+
+def _fallback(part: PartStatus) -> str:
+    pending = not part.ready and part.name in OPTIONAL_PARTS
+    return "none is running: skeletons are pending until one is" if pending else ""

@@ -1,0 +1,1 @@
+"""The catalogue's schema, step by step; `service.catalogue` runs what is missing at start."""

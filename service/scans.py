@@ -1,0 +1,233 @@
+"""Scans as HTTP offers them: the rig's live ones and the catalogue's past ones as one."""
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Lock, Thread
+from types import TracebackType
+from typing import Any, Self
+
+from service.bell import Bell
+from service.catalogue import Catalogue, ScanRecord
+from service.rig import (
+    FINISHED,
+    Rig,
+    RigError,
+    RigEvent,
+    ScanSpec,
+    ScanState,
+    ScanStatus,
+    UnknownScanError,
+)
+from service.specs import fields_of, spec_from
+
+logger = logging.getLogger(__name__)
+
+
+class KeyReusedError(Exception):
+    """An idempotency key came back with another body."""
+
+
+class ScanOverError(RigError):
+    """The scan has ended; nothing can be done with it any more."""
+
+
+class Scans:
+    """Entering marks what a killed service left, and begins to note the rig's events.
+
+    Every method may be called from any thread; none may be called in an event loop.
+    """
+
+    def __init__(self, rig: Rig, catalogue: Catalogue, bell: Bell) -> None:
+        self.catalogue = catalogue
+        self._rig = rig
+        self._bell = bell
+        self._events: SimpleQueue[RigEvent | None] = SimpleQueue()
+        self._starting = Lock()
+        self._refreshing = Lock()
+        self._journal = Thread(target=self._write_journal, name="journal", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Recover the catalogue and follow the rig."""
+        for scan_id in self.catalogue.recover():
+            logger.warning("scan was under way when the service ended scan_id=%s", scan_id)
+        self._rig.subscribe(self._events.put)
+        self._journal.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Note what is still to be noted."""
+        self._events.put(None)
+        self._journal.join()
+
+    def start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
+        """Start a scan and return its status fields; once for each key, whatever happens.
+
+        Scan and key are noted before the arm may move: after a crash the same key finds the scan
+        that was under way instead of starting another.
+
+        Raises:
+            KeyReusedError: the key was used for another body.
+            RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved, the key is free.
+        """
+        with self._starting:
+            used = self.catalogue.used_key(key)
+            if used is None:
+                return self._start(spec, key, body_sha256)
+        if used.body_sha256 != body_sha256:
+            raise KeyReusedError(f"this Idempotency-Key was used for scan {used.scan_id}")
+        return used.response or status_fields(self.status(used.scan_id))
+
+    def _start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
+        status = ScanStatus(
+            scan_id=spec.scan_id,
+            tree_id=spec.tree_id,
+            state=ScanState.RUNNING,
+            views_done=0,
+            views_total=len(spec.waypoints),
+        )
+        self.catalogue.add_scan(status, fields_of(spec), key, body_sha256)
+        try:
+            answer = status_fields(self._rig.start(spec))
+        except RigError:
+            self.catalogue.drop_scan(spec.scan_id)
+            raise
+        except Exception as error:
+            failed = replace(status, state=ScanState.FAILED, detail=f"could not start: {error}")
+            self.catalogue.update(failed)
+            raise
+        self._refresh(spec.scan_id)
+        self.catalogue.keep_response(key, answer)
+        return answer
+
+    def record(self, scan_id: str) -> ScanRecord:
+        """Return what is known of a scan.
+
+        Raises:
+            UnknownScanError: there never was one.
+        """
+        record = self.catalogue.scan(scan_id)
+        if record is None:
+            raise UnknownScanError(f"there is no scan {scan_id!r}; GET /v1/scans lists them")
+        return record
+
+    def status(self, scan_id: str) -> ScanStatus:
+        """Return a scan as it is now, or as it ended. Raises UnknownScanError."""
+        return self.status_of(self.record(scan_id))
+
+    def status_of(self, record: ScanRecord) -> ScanStatus:
+        """Return the status of a scan: the rig's word where it has one."""
+        if record.state in FINISHED:
+            return record.status
+        try:
+            return self._rig.status(record.scan_id)
+        except UnknownScanError:
+            return record.status
+
+    def recording(self, scan_id: str) -> Path | None:
+        """Return where the recording of a scan is, None while there is none."""
+        return self._recording_path(scan_id) or self.record(scan_id).recording
+
+    def active(self) -> ScanStatus | None:
+        """Return the newest scan that can still go on, None if there is none."""
+        unfinished = self.catalogue.unfinished()
+        return self.status(unfinished[0].scan_id) if unfinished else None
+
+    def pause(self, scan_id: str) -> ScanStatus:
+        """Stop the arm and keep the scan. Raises UnknownScanError."""
+        return self._command(scan_id, self._rig.pause, lambda record: record.status)
+
+    def resume(self, scan_id: str) -> ScanStatus:
+        """Go on with a scan, also with one of an earlier life of the service.
+
+        Raises:
+            UnknownScanError, RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved.
+        """
+
+        def again(record: ScanRecord) -> ScanStatus:
+            return self._rig.start(spec_from(record.scan_id, record.request))
+
+        return self._command(scan_id, self._rig.resume, again)
+
+    def cancel(self, scan_id: str) -> ScanStatus:
+        """End a scan; its recording stays. Raises UnknownScanError."""
+
+        def end(record: ScanRecord) -> ScanStatus:
+            return replace(record.status, state=ScanState.CANCELLED, detail="cancelled")
+
+        return self._command(scan_id, self._rig.cancel, end)
+
+    def _command(
+        self,
+        scan_id: str,
+        ask_rig: Callable[[str], ScanStatus],
+        without_rig: Callable[[ScanRecord], ScanStatus],
+    ) -> ScanStatus:
+        """Have the rig do it; do it without where only the catalogue knows the scan."""
+        record = self.record(scan_id)
+        if record.state in FINISHED:
+            raise ScanOverError(f"scan {scan_id} is {record.state.value}; start a new one")
+        try:
+            status = ask_rig(scan_id)
+        except UnknownScanError:
+            status = without_rig(record)
+            self.catalogue.update(status)
+        self._refresh(scan_id)
+        self._bell.ring()
+        return status
+
+    def _refresh(self, scan_id: str) -> ScanStatus:
+        """Note where a scan is; the lock keeps an older answer from overwriting a newer one."""
+        with self._refreshing:
+            try:
+                status = self._rig.status(scan_id)
+                self.catalogue.update(status, self._recording_path(scan_id))
+            except UnknownScanError:
+                status = self.record(scan_id).status
+        return status
+
+    def _recording_path(self, scan_id: str) -> Path | None:
+        try:
+            return self._rig.recording_path(scan_id)
+        except UnknownScanError:
+            return None
+
+    def _write_journal(self) -> None:
+        while (event := self._events.get()) is not None:
+            try:
+                self._note(event)
+            except Exception:
+                # The recording holds the event too; the next ones must still be noted.
+                logger.exception("event not noted kind=%s scan_id=%s", event.kind, event.scan_id)
+            self._bell.ring()
+
+    def _note(self, event: RigEvent) -> None:
+        """Note event, status and skeleton; the skeleton first, so that who is told finds it."""
+        if self.catalogue.scan(event.scan_id) is None:
+            logger.info("event of no scan kind=%s fields=%s", event.kind, dict(event.fields))
+            return
+        skeleton = self._rig.skeleton(event.scan_id)
+        if skeleton is not None:
+            self.catalogue.add_revision(event.scan_id, skeleton)
+        status = self._refresh(event.scan_id)
+        data = status_fields(status) | {
+            "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "fields": json.loads(json.dumps(dict(event.fields), default=str)),
+        }
+        self.catalogue.add_event(event.scan_id, event.kind, data)
+
+
+def status_fields(status: ScanStatus) -> dict[str, Any]:
+    """Return a status ready for JSON."""
+    return {name: getattr(status, name) for name in ScanStatus.__slots__} | {
+        "state": status.state.value
+    }

@@ -1,0 +1,378 @@
+import json
+import threading
+
+import numpy as np
+import pytest
+from fake_rig import FakeRig
+from live_service import BODY, PATHS, read_events, serving, skeleton
+
+from service.http.requests import SpeedCaps
+from service.rig import RigNotReadyError, ScanState
+
+
+def problem(answer, status, code):
+    """Check that an answer is a whole problem document and return it."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    body = answer.json()
+    assert body["status"] == status
+    assert body["code"] == code
+    assert body["type"] == f"urn:canopy:problem:{code}"
+    assert body["instance"] == answer.url.path
+    assert body["title"]
+    assert body["detail"]
+    return body
+
+
+def test_a_scan_is_accepted_and_can_be_looked_at(live):
+    answer = live.post_scan(method="mst", voxel_size_m=0.01, retakes=1, speed_mps=0.1)
+    scan_id = answer.json()["scan_id"]
+    assert answer.status_code == 202
+    assert answer.headers["location"] == f"/v1/scans/{scan_id}"
+    scan = live.http.get(answer.headers["location"]).json()
+    assert (scan["tree_id"], scan["state"], scan["views_total"]) == ("apple-7", "running", 3)
+    [spec] = live.rig.specs
+    assert (spec.scan_id, spec.speed_mps, spec.acceleration_mps2) == (scan_id, 0.1, 0.5)
+    assert (spec.config.name, spec.config.likelihood.voxel_size_m) == ("mst", 0.01)
+    assert spec.retakes == 1
+
+
+def test_waypoints_become_poses_of_the_flange(live):
+    quarter_turn = [0.0, 0.0, 2**-0.5, 2**-0.5]
+    waypoint = {"position": [0.1, 0.2, 0.3], "quaternion_xyzw": quarter_turn}
+    live.start(path=None, waypoints=[waypoint])
+    [pose] = live.rig.specs[0].waypoints
+    expected = [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    assert pose == pytest.approx(np.array(expected))
+
+
+IDENTITY = [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"tree_id": None}, "tree_id"),
+        ({"tree_id": "../etc"}, "tree_id"),
+        ({"tree": "x"}, "tree"),
+        ({"method": "magic"}, "method"),
+        ({"voxel_size_m": 0}, "voxel_size_m"),
+        ({"speed_mps": -1}, "speed_mps"),
+        ({"retakes": 1000}, "retakes"),
+        ({"path": None}, "either path or waypoints"),
+        ({"path": None, "waypoints": []}, "waypoints"),
+        (
+            {"waypoints": [{"position": [0, 0, 0], "quaternion_xyzw": IDENTITY}]},
+            "either path or waypoints",
+        ),
+        (
+            {"path": None, "waypoints": [{"position": [0, 0], "quaternion_xyzw": IDENTITY}]},
+            "waypoints.0.position",
+        ),
+        (
+            {"path": None, "waypoints": [{"position": [0, 0, 0], "quaternion_xyzw": [0] * 4}]},
+            "unit quaternion",
+        ),
+    ],
+)
+def test_a_malformed_body_is_a_problem_that_names_the_place(live, changes, names):
+    body = problem(live.post_scan(**changes), 422, "invalid_request")
+    assert names in json.dumps(body["errors"])
+    assert not live.rig.specs
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
+def test_numbers_that_are_none_are_refused(live, number):
+    content = f'{{"tree_id": "a", "path": "short", "speed_mps": {number}}}'
+    headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
+    problem(live.http.post("/v1/scans", content=content, headers=headers), 422, "invalid_request")
+
+
+def test_bytes_that_are_no_json_are_refused(live):
+    headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
+    answer = live.http.post("/v1/scans", content=b"{not json", headers=headers)
+    problem(answer, 422, "invalid_request")
+
+
+def test_a_huge_body_is_refused(live):
+    headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
+    body = b" " * (2 << 20)
+    answer = live.http.post("/v1/scans", content=body, headers=headers)
+    assert str(1 << 20) in problem(answer, 413, "content_too_large")["detail"]
+    in_pieces = (body[i : i + 65536] for i in range(0, len(body), 65536))
+    answer = live.http.post("/v1/scans", content=in_pieces, headers=headers)
+    problem(answer, 411, "length_required")
+
+
+@pytest.mark.parametrize("name", ["speed_mps", "acceleration_mps2"])
+def test_speeds_over_the_cap_are_refused_before_the_rig_hears_of_them(tmp_path, name):
+    caps = SpeedCaps(speed_mps=0.2, acceleration_mps2=0.2)
+    with serving(tmp_path, caps=caps) as live:
+        body = problem(live.post_scan(**{name: 0.21}), 422, "plan_refused")
+        assert body["detail"] == f"{name} 0.21 is over the cap of 0.2; ask for less"
+        assert not live.rig.specs
+        live.start(**{name: 0.2})
+
+
+def test_an_unknown_path_is_refused_with_those_there_are(live):
+    body = problem(live.post_scan(path="orchard-11"), 422, "unknown_path")
+    assert "choose one of: short" in body["detail"]
+
+
+def test_refused_waypoints_come_with_the_reason_of_each(live):
+    near, far = ({"position": [x, 0, 0], "quaternion_xyzw": IDENTITY} for x in (0.5, 2.0))
+    answer = live.post_scan(path=None, waypoints=[near, far, near, far])
+    body = problem(answer, 422, "plan_refused")
+    assert body["waypoints"] == [
+        {"index": 1, "reason": "waypoint 1 is out of reach"},
+        {"index": 3, "reason": "waypoint 3 is out of reach"},
+    ]
+    assert live.http.get("/v1/scans").json()["scans"] == []
+
+
+def test_a_plan_has_a_verdict_for_every_waypoint_and_moves_nothing(live):
+    near, far = ({"position": [x, 0, 0], "quaternion_xyzw": IDENTITY} for x in (0.5, 2.0))
+    plan = live.http.post("/v1/plans", json={"waypoints": [near, far]}).json()
+    assert not plan["feasible"]
+    assert [w["reachable"] for w in plan["waypoints"]] == [True, False]
+    assert plan["waypoints"][1]["reason"] == "waypoint 1 is out of reach"
+    assert live.http.post("/v1/plans", json={"path": "short"}).json()["feasible"]
+    assert not live.rig.specs
+
+
+def test_a_second_scan_on_a_busy_arm_is_refused_not_queued(live):
+    first = live.start("k1")
+    body = problem(live.post_scan("k2"), 409, "rig_busy")
+    assert first in body["detail"]
+    live.rig.finish(first)
+    assert live.start("k2") != first
+
+
+def test_a_rig_that_is_not_ready_says_why_and_how_to_mend_it(live):
+    mend = "the robot is not in remote control; switch it on the pendant"
+    live.rig.refusal = RigNotReadyError(mend)
+    assert problem(live.post_scan(), 503, "rig_not_ready")["detail"] == mend
+    live.rig.refusal = None
+    live.start()
+
+
+def test_what_nobody_foresaw_leaks_nothing(live):
+    live.rig.refusal = RuntimeError("password=hunter2")
+    answer = live.post_scan()
+    body = problem(answer, 500, "internal_error")
+    assert "hunter2" not in answer.text
+    assert body["trace_id"] in body["detail"]
+    [scan] = live.http.get("/v1/scans").json()["scans"]
+    assert scan["state"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code"),
+    [
+        ("GET", "/v1/scans/none", 404, "unknown_scan"),
+        ("POST", "/v1/scans/none:pause", 404, "unknown_scan"),
+        ("POST", "/v1/scans/none:resume", 404, "unknown_scan"),
+        ("POST", "/v1/scans/none:cancel", 404, "unknown_scan"),
+        ("GET", "/v1/scans/none/events", 404, "unknown_scan"),
+        ("GET", "/v1/scans/none/skeleton", 404, "unknown_scan"),
+        ("GET", "/v1/scans/none/skeleton.glb", 404, "unknown_scan"),
+        ("GET", "/v1/scans/none/recording.mcap", 404, "unknown_scan"),
+        ("GET", "/v1/scans/none/views/0/color.jpg", 404, "unknown_scan"),
+        ("GET", "/v1/nothing", 404, "not_found"),
+        ("DELETE", "/v1/scans", 405, "method_not_allowed"),
+        ("GET", "/v1/rig:stop", 405, "method_not_allowed"),
+        ("GET", "/v1/scans?limit=0", 422, "invalid_request"),
+    ],
+)
+def test_every_error_is_a_problem(live, method, path, status, code):
+    answer = live.http.request(method, path)
+    problem(answer, status, code)
+    if status == 405:
+        assert answer.headers["allow"]
+
+
+def test_the_same_key_and_body_start_one_scan(live):
+    first, again = live.post_scan("k1"), live.post_scan("k1")
+    assert (again.status_code, again.json()) == (202, first.json())
+    assert again.headers["location"] == first.headers["location"]
+    live.rig.finish(first.json()["scan_id"])
+    assert live.post_scan("k1").json() == first.json()
+    assert len(live.rig.specs) == 1
+
+
+def test_the_same_key_with_another_body_is_refused(live):
+    live.start("k1")
+    problem(live.post_scan("k1", tree_id="apple-8"), 422, "idempotency_key_reused")
+
+
+def test_a_key_is_demanded(live):
+    problem(live.http.post("/v1/scans", json=BODY), 400, "idempotency_key_missing")
+
+
+def test_requests_at_once_with_one_key_start_one_scan(live):
+    answers = []
+    threads = [
+        threading.Thread(target=lambda: answers.append(live.post_scan("k1"))) for _ in range(8)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {answer.status_code for answer in answers} == {202}
+    assert len({answer.json()["scan_id"] for answer in answers}) == 1
+    assert len(live.rig.specs) == 1
+
+
+def test_pause_resume_cancel(live):
+    scan_id = live.start()
+    for verb, state in (("pause", "paused"), ("resume", "running"), ("cancel", "cancelled")):
+        answer = live.http.post(f"/v1/scans/{scan_id}:{verb}")
+        assert (answer.status_code, answer.json()["state"]) == (200, state)
+        assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == state
+    problem(live.http.post(f"/v1/scans/{scan_id}:resume"), 409, "scan_over")
+
+
+def test_pages_of_other_sites_cannot_command_the_rig_but_may_stop_it(live):
+    scan_id = live.start()
+    foreign = {"Origin": "https://example.org"}
+    for path in (f"/v1/scans/{scan_id}:resume", "/v1/rig:acknowledge", "/v1/scans"):
+        problem(live.http.post(path, json={}, headers=foreign), 403, "foreign_origin")
+    own = {"Origin": live.url}
+    assert live.http.post(f"/v1/scans/{scan_id}:pause", headers=own).status_code == 200
+    assert live.http.post("/v1/rig:stop", headers=foreign).status_code == 200
+    assert live.rig.stops == 1
+
+
+def test_stop_and_acknowledge(live):
+    assert [live.http.post("/v1/rig:stop").status_code for _ in range(2)] == [200, 200]
+    assert live.rig.stops == 2
+    problem(live.http.post("/v1/rig:acknowledge", json={"reason": " "}), 422, "invalid_request")
+    answer = live.http.post("/v1/rig:acknowledge", json={"reason": "branch removed"})
+    assert answer.status_code == 200
+    assert live.rig.acknowledged == ["branch removed"]
+    live.rig.refusal = RigNotReadyError("still in protective stop; unlock it on the pendant")
+    answer = live.http.post("/v1/rig:acknowledge", json={"reason": "branch removed"})
+    assert "pendant" in problem(answer, 503, "rig_not_ready")["detail"]
+
+
+def test_readiness_names_what_is_missing(live):
+    assert live.http.get("/healthz").status_code == 200
+    assert live.http.get("/readyz").json()["ready"]
+    live.rig.broken_parts["worker"] = ""
+    ready = live.http.get("/readyz")
+    assert ready.status_code == 200
+    worker = next(part for part in ready.json()["parts"] if part["name"] == "worker")
+    assert not worker["ready"]
+    assert "pending" in worker["detail"]
+    live.rig.broken_parts["camera"] = "no OAK device; plug it in"
+    body = problem(live.http.get("/readyz"), 503, "not_ready")
+    assert body["detail"] == "camera: no OAK device; plug it in"
+    assert len(body["parts"]) == 4
+    assert live.http.get("/healthz").status_code == 200
+
+
+def test_the_rig_shows_parts_paths_caps_and_the_scan_under_way(live):
+    assert live.http.get("/v1/rig").json()["scan"] is None
+    scan_id = live.start()
+    rig = live.http.get("/v1/rig").json()
+    assert rig["scan"]["scan_id"] == scan_id
+    assert rig["paths"] == {name: len(path) for name, path in PATHS.items()}
+    assert rig["caps"] == {"speed_mps": 0.25, "acceleration_mps2": 0.5}
+
+
+def test_scans_are_listed_newest_first_page_by_page(live):
+    started = []
+    for i in range(5):
+        started.append(live.start(f"k{i}"))
+        live.rig.finish(started[-1])
+    listed, before = [], None
+    while True:
+        params = {"limit": 2} | ({"before": before} if before else {})
+        page = live.http.get("/v1/scans", params=params).json()
+        listed += [scan["scan_id"] for scan in page["scans"]]
+        before = page["next"]
+        if before is None:
+            break
+    assert listed == started[::-1]
+
+
+def test_a_repeated_start_after_a_crash_moves_nothing(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start("k1")
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.post_scan("k1").json()["scan_id"] == scan_id
+        assert live.rig.specs == []
+
+
+def test_a_scan_of_an_earlier_life_waits_for_an_operator_and_goes_on(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start("k1", speed_mps=0.125)
+        [first] = live.rig.specs
+    with serving(tmp_path, FakeRig()) as live:
+        scan = live.http.get(f"/v1/scans/{scan_id}").json()
+        assert scan["state"] == "stopped"
+        assert "resume or cancel" in scan["detail"]
+        live.rig.refusal = RigNotReadyError("acknowledge first")
+        problem(live.http.post(f"/v1/scans/{scan_id}:resume"), 503, "rig_not_ready")
+        live.rig.refusal = None
+        answer = live.http.post(f"/v1/scans/{scan_id}:resume")
+        assert answer.json()["state"] == "running"
+        [spec] = live.rig.specs
+        assert (spec.scan_id, spec.speed_mps) == (first.scan_id, first.speed_mps)
+        assert all((a == b).all() for a, b in zip(spec.waypoints, first.waypoints, strict=True))
+
+
+def test_a_scan_of_an_earlier_life_can_be_cancelled(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+    with serving(tmp_path, FakeRig()) as live:
+        answer = live.http.post(f"/v1/scans/{scan_id}:cancel")
+        assert answer.json()["state"] == "cancelled"
+        assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "cancelled"
+
+
+def test_events_come_live_and_end_with_the_scan(live):
+    scan_id = live.start()
+    received = []
+    with live.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        for event in read_events(stream):
+            received.append(event)
+            if event["event"] == "started":
+                live.rig.photograph(scan_id, 0)
+            if event["event"] == "view":
+                live.rig.publish(scan_id, skeleton(scan_id, 1))
+            if event["event"] == "skeleton":
+                assert live.http.get(f"/v1/scans/{scan_id}/skeleton").status_code == 200
+                live.rig.finish(scan_id)
+    assert [event["event"] for event in received] == ["started", "view", "skeleton", "done", "end"]
+    assert [event.get("id") for event in received] == ["1", "2", "3", "4", None]
+    assert received[1]["data"]["views_done"] == 1
+    assert received[1]["data"]["fields"] == {"index": 0}
+    assert received[3]["data"]["state"] == "done"
+
+
+def test_events_resume_after_the_last_one_seen_also_in_another_life(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        for index in range(3):
+            live.rig.photograph(scan_id, index)
+        live.rig.finish(scan_id)
+    with serving(tmp_path, FakeRig()) as live:
+        path = f"/v1/scans/{scan_id}/events"
+        with live.http.stream("GET", path, headers={"Last-Event-ID": "2"}) as stream:
+            events = list(read_events(stream))
+        assert [event["event"] for event in events] == ["view", "view", "done", "end"]
+        assert [event["data"]["fields"] for event in events[:2]] == [{"index": 1}, {"index": 2}]
+        answer = live.http.get(path, headers={"Last-Event-ID": "x"})
+        problem(answer, 422, "invalid_request")
+
+
+def test_events_that_no_json_holds_do_not_stop_the_journal(live):
+    scan_id = live.start()
+    live.rig.tell(scan_id, "odd", path=ScanState, number=float("nan"))
+    live.rig.tell("no-such-scan", "view")
+    live.rig.finish(scan_id)
+    with live.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
+        kinds = [event["event"] for event in read_events(stream)]
+    assert kinds == ["started", "odd", "done", "end"]
