@@ -18,7 +18,7 @@ from mock_hw.replay.track import Track
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class _Way:
-    """A move under way. linear: which space it is straight in. stopped_s: where it was ended."""
+    """A move under way: from the pose `start` with its joints to the move's target with its."""
 
     move: Move
     start: FloatArray
