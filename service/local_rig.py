@@ -3,7 +3,7 @@
 import logging
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 ENOUGH_DISK_BYTES = 1 << 30
 STOP_TIMEOUT_S = 10.0
+SKELETON_TIMEOUT_S = 60.0
 
 
 class Feed(Protocol):
@@ -54,10 +55,14 @@ class Feed(Protocol):
         """Say whether a worker is there."""
         ...
 
+    def flush(self, timeout_s: float) -> bool:
+        """Wait until the skeleton of everything offered is here; say whether it is."""
+        ...
+
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class RigParts:
-    """What a rig is made of. tool_from_camera: (4, 4), the hand-eye calibration."""
+    """What a rig is made of; see also `ScanTools`. data: folder of the recordings."""
 
     arm: Arm
     camera: Camera
@@ -65,6 +70,7 @@ class RigParts:
     tool_from_camera: FloatArray
     feed: Feed
     data: Path
+    attachments: Callable[[], Mapping[str, bytes]] = dict
 
 
 class LocalRig:
@@ -203,14 +209,9 @@ class LocalRig:
         """Call `listener` for every event."""
         self._listeners.append(listener)
 
-    def adopt(self, spec: ScanSpec) -> None:
-        """Take over a scan that an earlier run of the service left unfinished; it can be resumed.
-
-        Its recording stays as it is until then.
-        """
-        session = self._session_for(spec)
-        session.conclude(ScanState.STOPPED)
-        self._sessions[spec.scan_id] = (spec, session)
+    def announce(self, scan_id: str, kind: str, fields: dict[str, object]) -> None:
+        """Tell the listeners of something that happened elsewhere, such as a new skeleton."""
+        self._tell(scan_id, kind, fields)
 
     def _launch(self, spec: ScanSpec) -> ScanStatus:
         session = self._session_for(spec)
@@ -229,11 +230,19 @@ class LocalRig:
                 camera=parts.camera,
                 limits=parts.limits,
                 tool_from_camera=parts.tool_from_camera,
+                attachments=parts.attachments,
             ),
             self._path(spec.scan_id),
             report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),
             recorded=lambda index: parts.feed.offer(spec.scan_id, index),
+            conclude_with=self._await_skeleton,
         )
+
+    def _await_skeleton(self, state: ScanState) -> None:
+        """Let the last views become a skeleton before the scan is done, if anybody works on it."""
+        feed = self._parts.feed
+        if state is ScanState.DONE and feed.worker().ready and not feed.flush(SKELETON_TIMEOUT_S):
+            log.warning("the skeleton of the last views is not there yet")
 
     def _interrupt(self, session: ScanSession, wanted: ScanState) -> None:
         session.interrupt(wanted)

@@ -9,7 +9,7 @@ power cut is the way after a pause.
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -47,20 +47,26 @@ class PictureRefusedError(Exception):
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class ScanTools:
-    """What a scan works with. tool_from_camera: (4, 4), the hand-eye calibration."""
+    """What a scan works with.
+
+    tool_from_camera: (4, 4), the hand-eye calibration. attachments: files that go with the finished
+    recording, by name; of a simulation the truth.
+    """
 
     arm: Arm
     camera: Camera
     limits: Limits
     tool_from_camera: FloatArray
     quality: QualityLimits = field(default_factory=QualityLimits)
+    attachments: Callable[[], Mapping[str, bytes]] = dict
 
 
 class ScanSession:
     """Drives one scan from where it is to its end, or until it is interrupted or stopped.
 
     `report(kind, fields)` is told of everything that happens, from the session's thread;
-    `recorded(index)` that a view is safe on disk.
+    `recorded(index)` that a view is safe on disk; `conclude_with(state)` is called before the scan
+    is said to have ended.
     """
 
     def __init__(
@@ -71,12 +77,14 @@ class ScanSession:
         *,
         report: Report,
         recorded: Callable[[int], None],
+        conclude_with: Callable[[ScanState], None] = lambda state: None,
     ) -> None:
         self.path = path
         self._spec = spec
         self._tools = tools
         self._report = report
         self._recorded = recorded
+        self._conclude_with = conclude_with
         self._wanted: ScanState | None = None
         self._state = ScanState.RUNNING
         self._detail = ""
@@ -158,7 +166,9 @@ class ScanSession:
             except (DriverError, PictureRefusedError, ScanInterruptedError) as error:
                 self._note(writer, "interrupted", reason=str(error))
                 raise
-            self._note(writer, "done", views_done=len(self._done))
+            for name, content in self._tools.attachments().items():
+                writer.attach(name, "application/json", content)
+            writer.write_event(time.time_ns(), {"kind": "done", "views_done": len(self._done)})
         self._end(ScanState.DONE, "")
 
     def _visit_all(self, writer: RecordingWriter) -> None:
@@ -231,6 +241,7 @@ class ScanSession:
         self._report(kind, fields)
 
     def _end(self, state: ScanState, detail: str) -> None:
+        self._conclude_with(state)
         with self._lock:
             self._state, self._detail = state, detail
         self._report(str(state), {"detail": detail} if detail else {})

@@ -1,0 +1,175 @@
+"""The only place that chooses between real hardware and simulation, and starts the processes."""
+
+import os
+import socket
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+from fastapi import FastAPI
+
+from canopy_skel.document import to_json
+from canopy_skel.geometry import FloatArray, invert
+from canopy_skel.recording.reader import GROUND_TRUTH
+from drivers.guarded_arm import GuardedArm, KeepOut, Limits
+from drivers.oak.camera import OakCamera
+from drivers.protocols import Arm, Camera
+from drivers.ur5.arm import Ur5Arm
+from drivers.ur5.messages import Ur5Config
+from mock_hw.fake_ur.process import FakeUr, free_host
+from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
+from mock_hw.orchard.simulate import Options, prepare
+from mock_hw.sim_camera import SimCamera
+from service.app import create_app
+from service.bus import Keys, open_session
+from service.catalogue import Catalogue
+from service.feeder import ScanSource, ViewFeeder
+from service.local_rig import LocalRig, RigParts
+from service.rig import PartStatus, ScanSpec
+from service.supervisor import Supervised
+
+LIMITS = Limits(
+    box_min_m=(-0.9, -0.9, -0.85),
+    box_max_m=(0.9, 0.9, 1.1),
+    keep_outs=(KeepOut(name="tree row", normal=(-1.0, 0.0, 0.0), offset_m=-0.75),),
+)
+PATHS: Mapping[str, list[FloatArray]] = {
+    f"orchard-{views}": [pose @ invert(TOOL_FROM_CAMERA) for pose in camera_path(views)]
+    for views in (10, 70)
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ServeOptions:
+    """What `canopy serve` is told. data: folder of recordings and catalogue.
+
+    robot: host of the controller; None = simulation, of which `orchard` says what stands there,
+    `time_scale` how much faster than real the arm moves and `picture_scale` the size of pictures.
+    """
+
+    data: Path
+    robot: str | None
+    site: str
+    rig: str
+    orchard: Options
+    time_scale: float
+    picture_scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class Hardware:
+    """Arm and camera, the hand-eye calibration, and what a simulation knows beyond them."""
+
+    arm: Arm
+    camera: Camera
+    tool_from_camera: FloatArray
+    attachments: Callable[[], Mapping[str, bytes]]
+
+
+class BusFeed:
+    """The feed of a rig: the bus, and behind it a worker. See `service.local_rig.Feed`."""
+
+    def __init__(self, feeder: ViewFeeder) -> None:
+        self._feeder = feeder
+
+    def begin(self, spec: ScanSpec, path: Path) -> None:
+        """Turn to a scan."""
+        part = path.with_name(path.name + ".part")
+        self._feeder.begin(
+            ScanSource(
+                scan_id=spec.scan_id,
+                config=spec.config,
+                segmenter=spec.segmenter,
+                recording=lambda: path if path.exists() else part,
+            )
+        )
+
+    def offer(self, scan_id: str, index: int) -> None:
+        """Have a recorded view sent."""
+        self._feeder.offer(index)
+
+    def skeleton(self, scan_id: str) -> bytes | None:
+        """Return the newest document."""
+        return self._feeder.latest_skeleton(scan_id)
+
+    def worker(self) -> PartStatus:
+        """Say whether a worker is there."""
+        return self._feeder.worker_status()
+
+    def flush(self, timeout_s: float) -> bool:
+        """Wait for the skeleton of all that was offered."""
+        return self._feeder.flush(timeout_s)
+
+
+@contextmanager
+def composed(options: ServeOptions) -> Iterator[FastAPI]:
+    """Start everything but the HTTP server and give its app; ends it all on leaving."""
+    with ExitStack() as stack:
+        hardware = stack.enter_context(
+            _simulated(options) if options.robot is None else _real(options)
+        )
+        feeder = stack.enter_context(_worker(options, lambda *news: announce(*news)))
+        rig = LocalRig(
+            RigParts(
+                arm=hardware.arm,
+                camera=hardware.camera,
+                limits=LIMITS,
+                tool_from_camera=hardware.tool_from_camera,
+                feed=BusFeed(feeder),
+                data=options.data,
+                attachments=hardware.attachments,
+            )
+        )
+
+        def announce(scan_id: str, document: bytes) -> None:
+            rig.announce(scan_id, "skeleton", {"bytes": len(document)})
+
+        stack.enter_context(rig)
+        catalogue = stack.enter_context(Catalogue(options.data))
+        yield create_app(rig, catalogue, PATHS)
+
+
+@contextmanager
+def _simulated(options: ServeOptions) -> Iterator[Hardware]:
+    simulation = prepare(options.orchard)
+    with FakeUr(free_host(), time_scale=options.time_scale) as controller:
+        arm = GuardedArm(Ur5Arm(Ur5Config(host=controller.host)), LIMITS)
+        camera = SimCamera(lambda: arm.state().pose, simulation, scale=options.picture_scale)
+        yield Hardware(
+            arm,
+            camera,
+            simulation.tool_from_camera,
+            lambda: {GROUND_TRUTH: to_json(camera.truth())},
+        )
+
+
+@contextmanager
+def _real(options: ServeOptions) -> Iterator[Hardware]:
+    arm = GuardedArm(Ur5Arm(Ur5Config(host=options.robot or "")), LIMITS)
+    yield Hardware(arm, OakCamera(), TOOL_FROM_CAMERA, dict)
+
+
+@contextmanager
+def _worker(
+    options: ServeOptions, on_skeleton: Callable[[str, bytes], None]
+) -> Iterator[ViewFeeder]:
+    """Listen on the bus and keep a worker running that connects to it."""
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    command = [sys.executable, "-m", "service.worker", "--connect", endpoint]
+    command += ["--site", options.site, "--rig", options.rig, "--parent", str(os.getpid())]
+    keys = Keys(site=options.site, rig=options.rig)
+    with ExitStack() as stack:
+        session: zenoh.Session = stack.enter_context(open_session(listen=endpoint))
+        stack.enter_context(Supervised("worker", command))
+        yield stack.enter_context(ViewFeeder(session, keys, on_skeleton))
+
+
+def _free_port() -> int:
+    """Return a port nobody listens on; zenoh cannot tell which it was given for port 0."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
