@@ -55,6 +55,7 @@ class Scans:
         """Recover the catalogue and follow the rig."""
         for scan_id in self.catalogue.recover():
             logger.warning("scan was under way when the service ended scan_id=%s", scan_id)
+            self._add_event(self.record(scan_id).status, "interrupted", {})
         self._rig.subscribe(self._events.put)
         self._journal.start()
         return self
@@ -162,7 +163,9 @@ class Scans:
         """End a scan; its recording stays. Raises UnknownScanError."""
 
         def end(record: ScanRecord) -> ScanStatus:
-            return replace(record.status, state=ScanState.CANCELLED, detail="cancelled")
+            status = replace(record.status, state=ScanState.CANCELLED, detail="cancelled")
+            self._add_event(status, "cancelled", {})
+            return status
 
         return self._command(scan_id, self._rig.cancel, end)
 
@@ -211,19 +214,24 @@ class Scans:
             self._bell.ring()
 
     def _note(self, event: RigEvent) -> None:
-        """Note event, status and skeleton; the skeleton first, so that who is told finds it."""
+        """Note event, status and skeleton; the skeleton first, so that who is told finds it.
+
+        A skeleton that a newer one has replaced by now is not kept.
+        """
         if self.catalogue.scan(event.scan_id) is None:
             logger.info("event of no scan kind=%s fields=%s", event.kind, dict(event.fields))
             return
         skeleton = self._rig.skeleton(event.scan_id)
         if skeleton is not None:
             self.catalogue.add_revision(event.scan_id, skeleton)
-        status = self._refresh(event.scan_id)
+        self._add_event(self._refresh(event.scan_id), event.kind, event.fields)
+
+    def _add_event(self, status: ScanStatus, kind: str, fields: Mapping[str, object]) -> None:
         data = status_fields(status) | {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "fields": json.loads(json.dumps(dict(event.fields), default=str)),
+            "fields": json.loads(json.dumps(dict(fields), default=str)),
         }
-        self.catalogue.add_event(event.scan_id, event.kind, data)
+        self.catalogue.add_event(status.scan_id, kind, data)
 
 
 def status_fields(status: ScanStatus) -> dict[str, Any]:

@@ -38,6 +38,7 @@ def make_server(
         host=host,
         port=port,
         log_level=log_level,
+        access_log=False,
         timeout_graceful_shutdown=_BACK_STOP_S,
         server_header=False,
     )

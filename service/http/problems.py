@@ -72,7 +72,7 @@ class Problem(Exception):  # noqa: N818  # what RFC 9457 calls it
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "default": {
         "description": "Problem (RFC 9457)",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemBody"}}},
+        "content": {MEDIA_TYPE: {"schema": ProblemBody.model_json_schema()}},
     }
 }
 

@@ -81,6 +81,14 @@ async def newest_skeleton_as(
     return await _newest(here, scan_id, _known_format(suffix), if_none_match, prefer)
 
 
+@router.get("/v1/scans/{scan_id}/skeleton/revisions/{revision}.{suffix}", response_class=Response)
+def skeleton_revision_as(
+    scan_id: KnownScan, revision: int, suffix: str, here: Here, if_none_match: IfNoneMatch = ""
+) -> Response:
+    """Return one revision as json, glb, swc, ply, csv or graphml."""
+    return _one(here, scan_id, revision, _known_format(suffix), if_none_match)
+
+
 @router.get("/v1/scans/{scan_id}/skeleton/revisions/{revision}", response_class=Response)
 def skeleton_revision(
     scan_id: KnownScan,
@@ -91,14 +99,6 @@ def skeleton_revision(
 ) -> Response:
     """Return one revision; all but the newest are final."""
     return _one(here, scan_id, revision, _negotiated(accept), if_none_match)
-
-
-@router.get("/v1/scans/{scan_id}/skeleton/revisions/{revision}.{suffix}", response_class=Response)
-def skeleton_revision_as(
-    scan_id: KnownScan, revision: int, suffix: str, here: Here, if_none_match: IfNoneMatch = ""
-) -> Response:
-    """Return one revision as json, glb, swc, ply, csv or graphml."""
-    return _one(here, scan_id, revision, _known_format(suffix), if_none_match)
 
 
 async def _newest(

@@ -13,3 +13,12 @@ def live(tmp_path):
 
     with serving(tmp_path) as live:
         yield live
+
+
+@pytest.fixture(scope="module")
+def idle(tmp_path_factory):
+    """One service for all tests of a file that start no scan."""
+    from live_service import serving
+
+    with serving(tmp_path_factory.mktemp("idle")) as live:
+        yield live

@@ -41,9 +41,11 @@ class Live:
 
 
 @contextmanager
-def serving(folder, rig: FakeRig | None = None, **options: object) -> Iterator[Live]:
+def serving(
+    folder, rig: FakeRig | None = None, *, port: int = 0, **options: object
+) -> Iterator[Live]:
     rig = rig or FakeRig()
-    with Catalogue(folder) as catalogue, socket.create_server(("127.0.0.1", 0)) as bound:
+    with Catalogue(folder) as catalogue, socket.create_server(("127.0.0.1", port)) as bound:
         app = create_app(rig, catalogue, PATHS, **options)
         server = make_server(app, log_level="warning")
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})

@@ -75,32 +75,32 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0]
         ),
     ],
 )
-def test_a_malformed_body_is_a_problem_that_names_the_place(live, changes, names):
-    body = problem(live.post_scan(**changes), 422, "invalid_request")
+def test_a_malformed_body_is_a_problem_that_names_the_place(idle, changes, names):
+    body = problem(idle.post_scan(**changes), 422, "invalid_request")
     assert names in json.dumps(body["errors"])
-    assert not live.rig.specs
+    assert not idle.rig.specs
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
-def test_numbers_that_are_none_are_refused(live, number):
+def test_numbers_that_are_none_are_refused(idle, number):
     content = f'{{"tree_id": "a", "path": "short", "speed_mps": {number}}}'
     headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
-    problem(live.http.post("/v1/scans", content=content, headers=headers), 422, "invalid_request")
+    problem(idle.http.post("/v1/scans", content=content, headers=headers), 422, "invalid_request")
 
 
-def test_bytes_that_are_no_json_are_refused(live):
+def test_bytes_that_are_no_json_are_refused(idle):
     headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
-    answer = live.http.post("/v1/scans", content=b"{not json", headers=headers)
+    answer = idle.http.post("/v1/scans", content=b"{not json", headers=headers)
     problem(answer, 422, "invalid_request")
 
 
-def test_a_huge_body_is_refused(live):
+def test_a_huge_body_is_refused(idle):
     headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
     body = b" " * (2 << 20)
-    answer = live.http.post("/v1/scans", content=body, headers=headers)
+    answer = idle.http.post("/v1/scans", content=body, headers=headers)
     assert str(1 << 20) in problem(answer, 413, "content_too_large")["detail"]
     in_pieces = (body[i : i + 65536] for i in range(0, len(body), 65536))
-    answer = live.http.post("/v1/scans", content=in_pieces, headers=headers)
+    answer = idle.http.post("/v1/scans", content=in_pieces, headers=headers)
     problem(answer, 411, "length_required")
 
 
@@ -114,30 +114,30 @@ def test_speeds_over_the_cap_are_refused_before_the_rig_hears_of_them(tmp_path, 
         live.start(**{name: 0.2})
 
 
-def test_an_unknown_path_is_refused_with_those_there_are(live):
-    body = problem(live.post_scan(path="orchard-11"), 422, "unknown_path")
+def test_an_unknown_path_is_refused_with_those_there_are(idle):
+    body = problem(idle.post_scan(path="orchard-11"), 422, "unknown_path")
     assert "choose one of: short" in body["detail"]
 
 
-def test_refused_waypoints_come_with_the_reason_of_each(live):
+def test_refused_waypoints_come_with_the_reason_of_each(idle):
     near, far = ({"position": [x, 0, 0], "quaternion_xyzw": IDENTITY} for x in (0.5, 2.0))
-    answer = live.post_scan(path=None, waypoints=[near, far, near, far])
+    answer = idle.post_scan(path=None, waypoints=[near, far, near, far])
     body = problem(answer, 422, "plan_refused")
     assert body["waypoints"] == [
         {"index": 1, "reason": "waypoint 1 is out of reach"},
         {"index": 3, "reason": "waypoint 3 is out of reach"},
     ]
-    assert live.http.get("/v1/scans").json()["scans"] == []
+    assert idle.http.get("/v1/scans").json()["scans"] == []
 
 
-def test_a_plan_has_a_verdict_for_every_waypoint_and_moves_nothing(live):
+def test_a_plan_has_a_verdict_for_every_waypoint_and_moves_nothing(idle):
     near, far = ({"position": [x, 0, 0], "quaternion_xyzw": IDENTITY} for x in (0.5, 2.0))
-    plan = live.http.post("/v1/plans", json={"waypoints": [near, far]}).json()
+    plan = idle.http.post("/v1/plans", json={"waypoints": [near, far]}).json()
     assert not plan["feasible"]
     assert [w["reachable"] for w in plan["waypoints"]] == [True, False]
     assert plan["waypoints"][1]["reason"] == "waypoint 1 is out of reach"
-    assert live.http.post("/v1/plans", json={"path": "short"}).json()["feasible"]
-    assert not live.rig.specs
+    assert idle.http.post("/v1/plans", json={"path": "short"}).json()["feasible"]
+    assert not idle.rig.specs
 
 
 def test_a_second_scan_on_a_busy_arm_is_refused_not_queued(live):
@@ -184,8 +184,8 @@ def test_what_nobody_foresaw_leaks_nothing(live):
         ("GET", "/v1/scans?limit=0", 422, "invalid_request"),
     ],
 )
-def test_every_error_is_a_problem(live, method, path, status, code):
-    answer = live.http.request(method, path)
+def test_every_error_is_a_problem(idle, method, path, status, code):
+    answer = idle.http.request(method, path)
     problem(answer, status, code)
     if status == 405:
         assert answer.headers["allow"]
@@ -205,8 +205,8 @@ def test_the_same_key_with_another_body_is_refused(live):
     problem(live.post_scan("k1", tree_id="apple-8"), 422, "idempotency_key_reused")
 
 
-def test_a_key_is_demanded(live):
-    problem(live.http.post("/v1/scans", json=BODY), 400, "idempotency_key_missing")
+def test_a_key_is_demanded(idle):
+    problem(idle.http.post("/v1/scans", json=BODY), 400, "idempotency_key_missing")
 
 
 def test_requests_at_once_with_one_key_start_one_scan(live):

@@ -1,0 +1,212 @@
+import hashlib
+import json
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+from fake_rig import DEMO_RECORDING, FakeRig
+from live_service import serving, skeleton, wait_until
+
+from canopy_skel.document import from_json
+from canopy_skel.exports import FORMATS
+from canopy_skel.recording import read_recording
+from canopy_skel.schema import schema_text
+from service.http.negotiation import best_media_type, wait_s
+from service.http.skeletons import MEDIA_TYPES
+
+
+@pytest.fixture
+def scan(live):
+    """A live service with a scan that has revisions 1 and 2."""
+    live.scan_id = live.start()
+    live.path = f"/v1/scans/{live.scan_id}/skeleton"
+    live.first, live.second = (skeleton(live.scan_id, n, length_m=n) for n in (1, 2))
+    for document in (live.first, live.second):
+        live.rig.publish(live.scan_id, document)
+        wait_until(lambda document=document: live.http.get(live.path).content == document)
+    return live
+
+
+def test_a_skeleton_is_pending_until_there_is_one(live):
+    scan_id = live.start()
+    answer = live.http.get(f"/v1/scans/{scan_id}/skeleton")
+    assert (answer.status_code, answer.json()["code"]) == (404, "skeleton_pending")
+    assert answer.headers["retry-after"] == "2"
+    assert "no worker" not in answer.json()["detail"]
+    live.rig.broken_parts["worker"] = "start `canopy worker`"
+    answer = live.http.get(f"/v1/scans/{scan_id}/skeleton")
+    assert "no worker: start `canopy worker`" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("name", MEDIA_TYPES)
+def test_every_format_by_suffix_and_by_accept(scan, name):
+    assert set(MEDIA_TYPES) == set(FORMATS)
+    expected = FORMATS[name](from_json(scan.second))
+    by_suffix = scan.http.get(f"{scan.path}.{name}")
+    by_accept = scan.http.get(scan.path, headers={"Accept": MEDIA_TYPES[name]})
+    for answer in (by_suffix, by_accept):
+        assert answer.content == expected
+        assert answer.headers["content-type"].split(";")[0] == MEDIA_TYPES[name]
+        assert answer.headers["etag"] == f'"{hashlib.sha256(expected).hexdigest()}"'
+        assert answer.headers["cache-control"] == "no-cache"
+        assert answer.headers["vary"] == "Accept"
+    old = scan.http.get(f"{scan.path}/revisions/1.{name}")
+    assert old.content == FORMATS[name](from_json(scan.first))
+
+
+def test_json_is_served_byte_for_byte(scan):
+    assert scan.http.get(scan.path).content == scan.second
+    assert scan.http.get(f"{scan.path}/revisions/1").content == scan.first
+
+
+def test_validators_spare_the_transfer(scan):
+    answer = scan.http.get(scan.path)
+    etag = answer.headers["etag"]
+    for listed in (etag, f'"other", W/{etag}', "*"):
+        again = scan.http.get(scan.path, headers={"If-None-Match": listed})
+        assert (again.status_code, again.content) == (304, b"")
+        assert again.headers["etag"] == etag
+    assert scan.http.get(scan.path, headers={"If-None-Match": '"other"'}).status_code == 200
+    glb = {"If-None-Match": etag, "Accept": "model/gltf-binary"}
+    assert scan.http.get(scan.path, headers=glb).status_code == 200
+
+
+def test_all_revisions_but_the_newest_are_final(scan):
+    first, second = (scan.http.get(f"{scan.path}/revisions/{n}") for n in (1, 2))
+    assert "immutable" in first.headers["cache-control"]
+    assert second.headers["cache-control"] == "no-cache"
+    rejected = json.loads(scan.second)
+    rejected["views"]["rejected"] = [{"index": 2, "reason": "blurred"}]
+    corrected = json.dumps(rejected).encode()
+    scan.rig.publish(scan.scan_id, corrected)
+    wait_until(lambda: scan.http.get(scan.path).content == corrected)
+    assert scan.http.get(f"{scan.path}/revisions/2").content == corrected
+
+
+def test_a_worker_that_starts_over_does_not_take_the_skeleton_back(scan):
+    scan.rig.publish(scan.scan_id, scan.first)
+    scan.rig.finish(scan.scan_id)
+    wait_until(lambda: scan.http.get(f"/v1/scans/{scan.scan_id}").json()["state"] == "done")
+    assert scan.http.get(scan.path).content == scan.second
+
+
+def test_what_there_is_not(scan):
+    for path, code in (("/revisions/9", "unknown_revision"), (".obj", "unknown_format")):
+        answer = scan.http.get(f"{scan.path}{path}")
+        assert (answer.status_code, answer.json()["code"]) == (404, code)
+    answer = scan.http.get(scan.path, headers={"Accept": "image/png"})
+    assert (answer.status_code, answer.json()["code"]) == (406, "not_acceptable")
+
+
+def test_a_planner_waits_for_the_first_and_for_the_next_skeleton(live):
+    scan_id = live.start()
+    path, etag = f"/v1/scans/{scan_id}/skeleton", ""
+    for revision in (1, 2):
+        document = skeleton(scan_id, revision, length_m=revision)
+        publisher = threading.Timer(0.4, live.rig.publish, (scan_id, document))
+        publisher.start()
+        asked_s = time.perf_counter()
+        headers = {"Prefer": "respond-async, wait=5", "If-None-Match": etag}
+        answer = live.http.get(path, headers=headers)
+        assert (answer.status_code, answer.content) == (200, document)
+        assert answer.headers["preference-applied"] == "wait=5"
+        assert 0.3 < time.perf_counter() - asked_s < 2
+        etag = answer.headers["etag"]
+        publisher.join()
+    answer = live.http.get(path, headers={"Prefer": "wait=1", "If-None-Match": etag})
+    assert answer.status_code == 304
+
+
+def test_skeletons_outlive_the_service(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        live.rig.publish(scan_id, document := skeleton(scan_id, 1))
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.http.get(f"/v1/scans/{scan_id}/skeleton").content == document
+
+
+def test_the_schema_is_served(idle):
+    answer = idle.http.get("/v1/schemas/canopy-skeleton-1.json")
+    assert answer.text == schema_text()
+
+
+@pytest.mark.parametrize(
+    ("accept", "chosen"),
+    [
+        ("*/*", "a/json"),
+        ("", None),
+        ("b/glb", "b/glb"),
+        ("a/json;q=0.5, b/glb", "b/glb"),
+        ("*/*;q=0.1, B/*", "b/glb"),
+        ("a/json;q=0, */*", "b/glb"),
+        ("a/json;q=x", None),
+        ("c/d", None),
+    ],
+)
+def test_accept(accept, chosen):
+    assert best_media_type(accept, ["a/json", "b/glb"]) == chosen
+
+
+@pytest.mark.parametrize(
+    ("prefer", "seconds"),
+    [("wait=7", 7), ("wait = 7", 7), ("a; wait=7", 7), ("wait=999", 60), ("wait=-1", 0), ("", 0)],
+)
+def test_prefer(prefer, seconds):
+    assert wait_s(prefer) == seconds
+
+
+@pytest.fixture(params=["whole", "growing"])
+def recorded(request, tmp_path):
+    """A service whose rig has the demo's recording, finished or cut as by a scan under way."""
+    path = tmp_path / "scan.mcap"
+    content = DEMO_RECORDING.read_bytes()
+    if request.param == "whole":
+        path.write_bytes(content)
+    else:
+        path.with_name("scan.mcap.part").write_bytes(content[: len(content) * 2 // 3])
+    with serving(tmp_path / "state", FakeRig(recording=path)) as live:
+        live.base = f"/v1/scans/{live.start()}"
+        yield live
+
+
+def test_pictures_are_those_of_the_recording(recorded):
+    view = next(read_recording(DEMO_RECORDING).views())
+    color = recorded.http.get(f"{recorded.base}/views/{view.index}/color.jpg")
+    assert color.headers["content-type"] == "image/jpeg"
+    bgr = cv2.imdecode(np.frombuffer(color.content, np.uint8), cv2.IMREAD_COLOR)
+    assert np.array_equal(bgr[:, :, ::-1], view.color_rgb)
+    depth = recorded.http.get(f"{recorded.base}/views/{view.index}/depth.png")
+    assert depth.headers["content-type"] == "image/png"
+    depth_mm = cv2.imdecode(np.frombuffer(depth.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert depth_mm.dtype == np.uint16
+    assert np.array_equal(depth_mm, np.nan_to_num(view.depth_m * 1000).round())
+
+
+def test_a_view_that_is_not_recorded_is_named(recorded):
+    answer = recorded.http.get(f"{recorded.base}/views/99/color.jpg")
+    assert (answer.status_code, answer.json()["code"]) == (404, "no_picture")
+    assert "view 99" in answer.json()["detail"]
+
+
+def test_the_recording_can_be_downloaded_in_ranges(recorded):
+    answer = recorded.http.get(f"{recorded.base}/recording.mcap")
+    assert DEMO_RECORDING.read_bytes().startswith(answer.content)
+    part = recorded.http.get(f"{recorded.base}/recording.mcap", headers={"Range": "bytes=8-15"})
+    assert (part.status_code, part.content) == (206, answer.content[8:16])
+
+
+def test_pictures_come_as_the_recording_grows(tmp_path):
+    part = tmp_path / "scan.mcap.part"
+    with serving(tmp_path / "state", FakeRig(recording=tmp_path / "scan.mcap")) as live:
+        base = f"/v1/scans/{live.start()}"
+        for path in ("views/0/color.jpg", "recording.mcap"):
+            assert live.http.get(f"{base}/{path}").status_code == 404
+        content = DEMO_RECORDING.read_bytes()
+        part.write_bytes(content[:1000])
+        assert live.http.get(f"{base}/views/0/color.jpg").status_code == 404
+        part.write_bytes(content[:-100])
+        picture = live.http.get(f"{base}/views/0/color.jpg").content
+        part.rename(tmp_path / "scan.mcap")
+        assert live.http.get(f"{base}/views/0/color.jpg").content == picture
