@@ -258,6 +258,63 @@ def serve(
         make_server(service, host=host, port=port).run()
 
 
+@app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})
+def worker(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+    """Run a skeleton worker by itself: --connect ENDPOINT --site SITE --rig RIG [--id ID]."""
+    # Imported here: only workers need the bus.
+    from service.worker import main as run_worker
+
+    run_worker(arguments or [])
+
+
+@app.command()
+def scan(
+    output: Out,
+    tree: Annotated[str, typer.Option(help="Which tree this is.")] = "tree",
+    path: Annotated[str, typer.Option(help="Named path of waypoints.")] = "orchard-10",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
+    url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
+    as_json: AsJson = False,
+) -> None:
+    """Start a scan over HTTP, show how it goes, and fetch its recording and skeleton."""
+    # Imported here: only this command talks HTTP.
+    from service.scan_client import ScanEvent, fetch
+    from service.scan_client import scan as run_scan
+
+    require_writable(output)
+    with _progress() as progress:
+        task = progress.add_task(tree, total=None)
+
+        def show(event: ScanEvent) -> None:
+            status = event.status
+            progress.update(task, completed=status.views_done, total=status.views_total)
+            if event.kind in ("retake", "stopped", "failed"):
+                stderr.print(f"{event.kind}: {status.detail or dict(event.fields)}", markup=False)
+
+        body = {"tree_id": tree, "path": path, "method": method, "voxel_size_m": voxel}
+        result = run_scan(url, body, show)
+    status = result.status
+    contents = {f"{status.scan_id}.mcap": fetch(url, f"/v1/scans/{status.scan_id}/recording.mcap")}
+    if result.skeleton is not None:
+        contents[f"{status.scan_id}.skeleton.json"] = result.skeleton
+    files = [str(file) for file in write_all(output, contents)]
+    if as_json:
+        typer.echo(json.dumps({"scan_id": status.scan_id, "state": status.state, "files": files}))
+    else:
+        typer.echo(
+            f"scan {status.scan_id} is {status.state}: {status.views_done} of"
+            f" {status.views_total} views" + (f"; {status.detail}" if status.detail else "")
+        )
+        for file in files:
+            typer.echo(f"  {file}")
+    if status.state != "done":
+        raise typer.Exit(Exit.FAILED)
+    if not result.complete:
+        stderr.print("warning: the worker has not finished the skeleton of all views")
+        raise typer.Exit(Exit.PARTIAL)
+
+
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
     """Check that this machine has what canopy needs."""

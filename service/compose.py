@@ -4,7 +4,7 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,12 +105,17 @@ class BusFeed:
 
 
 @contextmanager
-def composed(options: ServeOptions) -> Iterator[FastAPI]:
-    """Start everything but the HTTP server and give its app; ends it all on leaving."""
+def composed(
+    options: ServeOptions,
+    hardware_of: Callable[[ServeOptions], AbstractContextManager[Hardware]] | None = None,
+) -> Iterator[FastAPI]:
+    """Start everything but the HTTP server and give its app; ends it all on leaving.
+
+    `hardware_of` brings other hardware than the options name.
+    """
+    chosen = hardware_of or (simulated if options.robot is None else _real)
     with ExitStack() as stack:
-        hardware = stack.enter_context(
-            _simulated(options) if options.robot is None else _real(options)
-        )
+        hardware = stack.enter_context(chosen(options))
         feeder = stack.enter_context(_worker(options, lambda *news: announce(*news)))
         rig = LocalRig(
             RigParts(
@@ -132,11 +137,17 @@ def composed(options: ServeOptions) -> Iterator[FastAPI]:
         yield create_app(rig, catalogue, PATHS)
 
 
+def guarded(host: str) -> Arm:
+    """Return the arm behind a controller, within the limits of the rig."""
+    return GuardedArm(Ur5Arm(Ur5Config(host=host)), LIMITS)
+
+
 @contextmanager
-def _simulated(options: ServeOptions) -> Iterator[Hardware]:
+def simulated(options: ServeOptions) -> Iterator[Hardware]:
+    """Give an arm behind a fake controller, and a camera that sees a grown tree."""
     simulation = prepare(options.orchard)
     with FakeUr(free_host(), time_scale=options.time_scale) as controller:
-        arm = GuardedArm(Ur5Arm(Ur5Config(host=controller.host)), LIMITS)
+        arm = guarded(controller.host)
         camera = SimCamera(lambda: arm.state().pose, simulation, scale=options.picture_scale)
         yield Hardware(
             arm,
@@ -148,8 +159,7 @@ def _simulated(options: ServeOptions) -> Iterator[Hardware]:
 
 @contextmanager
 def _real(options: ServeOptions) -> Iterator[Hardware]:
-    arm = GuardedArm(Ur5Arm(Ur5Config(host=options.robot or "")), LIMITS)
-    yield Hardware(arm, OakCamera(), TOOL_FROM_CAMERA, dict)
+    yield Hardware(guarded(options.robot or ""), OakCamera(), TOOL_FROM_CAMERA, dict)
 
 
 @contextmanager
@@ -157,7 +167,7 @@ def _worker(
     options: ServeOptions, on_skeleton: Callable[[str, bytes], None]
 ) -> Iterator[ViewFeeder]:
     """Listen on the bus and keep a worker running that connects to it."""
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "service.worker", "--connect", endpoint]
     command += ["--site", options.site, "--rig", options.rig, "--parent", str(os.getpid())]
     keys = Keys(site=options.site, rig=options.rig)
@@ -167,7 +177,7 @@ def _worker(
         yield stack.enter_context(ViewFeeder(session, keys, on_skeleton))
 
 
-def _free_port() -> int:
+def free_port() -> int:
     """Return a port nobody listens on; zenoh cannot tell which it was given for port 0."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

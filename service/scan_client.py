@@ -83,6 +83,16 @@ def scan(
     return ScanResult(status=status, skeleton=skeleton, complete=complete)
 
 
+def fetch(url: str, path: str) -> bytes:
+    """Return what lies at a path of the service.
+
+    Raises:
+        RefusedError, UnreachableServiceError: as `scan`.
+    """
+    with ScanClient(url) as client:
+        return client.fetch(path)
+
+
 class ScanClient:
     """Talks to one service; requests that may be repeated are, for `patience_s`."""
 
@@ -116,6 +126,10 @@ class ScanClient:
     def status(self, scan_id: str) -> ScanStatus:
         """Return where a scan is. Raises as `start`."""
         return _status(self._ask("GET", f"/v1/scans/{scan_id}").json())
+
+    def fetch(self, path: str) -> bytes:
+        """Return what lies at a path."""
+        return self._ask("GET", path).content
 
     def cancel(self, scan_id: str) -> ScanStatus:
         """Stop the arm and end the scan. Raises as `start`."""

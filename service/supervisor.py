@@ -59,7 +59,8 @@ class Supervised:
     def _launch(self) -> None:
         with self._lock:
             if not self._ending.is_set():
-                self._process = subprocess.Popen(self._command)
+                # A session of its own: Ctrl-C is for us, and we end our children in order.
+                self._process = subprocess.Popen(self._command, start_new_session=True)
 
     def _watch(self) -> None:
         pause_s = FIRST_PAUSE_S
