@@ -8,7 +8,7 @@ Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def index_voxels(voxels: Int32s, top: Int32s, origin: Ints) -> Int32s:
     """Fill `top` (all -1) and return slots (B, 512): the place of each voxel in the list, or -1."""
     count = 0
@@ -25,7 +25,7 @@ def index_voxels(voxels: Int32s, top: Int32s, origin: Ints) -> Int32s:
     return slots
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def find(top: Int32s, origin: Ints, slots: Int32s, x: int, y: int, z: int) -> int:
     """Return the place of voxel (x, y, z) in the list, or -1."""
     bx, by, bz = (x >> 3) - origin[0], (y >> 3) - origin[1], (z >> 3) - origin[2]
@@ -37,7 +37,7 @@ def find(top: Int32s, origin: Ints, slots: Int32s, x: int, y: int, z: int) -> in
     return int(slots[block, ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def find_all(top: Int32s, origin: Ints, slots: Int32s, voxels: Int32s) -> Int32s:
     """Return the places (N,) of (N, 3) voxels, -1 where a voxel is not in the list."""
     found = np.full(len(voxels), -1, dtype=np.int32)

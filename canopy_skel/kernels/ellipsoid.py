@@ -20,7 +20,7 @@ MAX_SUM = 1 << 30
 """Sums saturate here (16384 nat): room for one more addition below the int32 limit."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def row_range(
     start: Floats, axis: Floats, length: float, radius: float, reach: float, x: int, y: int
 ) -> tuple[int, int]:
@@ -52,7 +52,7 @@ def row_range(
     return math.ceil(start[2] + low - 0.5), math.floor(start[2] + high - 0.5) + 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def box_of(
     start: Floats, axis: Floats, length: float, radius: float, reach: float, dimension: int
 ) -> tuple[int, int]:
@@ -63,7 +63,7 @@ def box_of(
     return math.floor(min(near, far) - margin), math.floor(max(near, far) + margin) + 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def rows_of_segments(
     starts: Floats, axes: Floats, lengths: Floats, radii: Floats, reach: float
 ) -> Int32s:
@@ -87,7 +87,7 @@ def rows_of_segments(
     return rows[:count].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def units_at(
     start: Floats,
     axis: Floats,
@@ -112,7 +112,7 @@ def units_at(
     return round(-math.log1p(-p) * UNITS_PER_NAT)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def voxels_on_segment(start: Floats, end: Floats) -> Int32s:
     """Return (N, 3) voxels a segment passes through (Amanatides and Woo's traversal)."""
     voxel = np.floor(start).astype(np.int32)
@@ -136,7 +136,7 @@ def voxels_on_segment(start: Floats, end: Floats) -> Int32s:
     return visited
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def mark_blocks(rows: Int32s, top: Int32s, origin: Ints) -> None:
     """Set top = -2 for every unallocated (-1) 8^3 block that a row touches."""
     for r in range(len(rows)):
@@ -146,7 +146,7 @@ def mark_blocks(rows: Int32s, top: Int32s, origin: Ints) -> None:
                 top[bx, by, bz] = -2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def add_to(sums: Int32s, top: Int32s, origin: Ints, x: int, y: int, z: int, units: int) -> None:
     """Add to one voxel's sum, saturating at MAX_SUM; its block must be allocated."""
     block = top[(x >> 3) - origin[0], (y >> 3) - origin[1], (z >> 3) - origin[2]]
@@ -154,7 +154,7 @@ def add_to(sums: Int32s, top: Int32s, origin: Ints, x: int, y: int, z: int, unit
     sums[block, offset] = min(sums[block, offset] + units, MAX_SUM)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def accumulate(
     rows: Int32s,
     starts: Floats,

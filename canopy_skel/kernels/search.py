@@ -25,14 +25,14 @@ STEP_LENGTH = (0, 5, 7, 9)
 UNREACHED = 1 << 62
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def edge_weight(q_u: float, q_v: float, step: int) -> int:
     """Return -log((p_u + p_v) / 2) (paper eq. 4) with its length, from q = 1 - p."""
     cost: int = round(-math.log1p(-0.5 * (q_u + q_v)) * UNITS_PER_NAT)
     return (cost << LENGTH_BITS) + STEP_LENGTH[step]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def root_of(parent: Int32s, label: int) -> int:
     """Return the representative of a component, shortening the way to it."""
     while parent[label] != label:
@@ -41,7 +41,7 @@ def root_of(parent: Int32s, label: int) -> int:
     return label
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def neighbours_of(voxels: Int32s, top: Int32s, origin: Ints, slots: Int32s, node: int) -> Ints:
     """Return (n, 2): the 26-neighbours of a node and how many coordinates differ (1, 2 or 3)."""
     found = np.zeros((26, 2), dtype=np.int64)
@@ -60,7 +60,7 @@ def neighbours_of(voxels: Int32s, top: Int32s, origin: Ints, slots: Int32s, node
     return found[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def settle(
     heap: list[tuple[int, int]],
     voxels: Int32s,
@@ -99,7 +99,7 @@ def settle(
     return np.unique(np.array(changed))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def borders(
     nodes: Ints,
     voxels: Int32s,
@@ -126,7 +126,7 @@ def borders(
     return edges
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trace(previous: Int32s, u: int, v: int) -> Ints:
     """Return the path over edge (u, v), from the source behind u to the source behind v."""
     path = [u]
@@ -139,7 +139,7 @@ def trace(previous: Int32s, u: int, v: int) -> Ints:
     return np.array(path)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def join_components(
     voxels: Int32s,
     q: Floats,

@@ -13,7 +13,7 @@ Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cells_around(top: Int32s, origin: Ints, slots: Int32s, x: int, y: int, z: int) -> Ints:
     """Return the occupied cells among the 27 around (x, y, z)."""
     found = np.zeros(27, dtype=np.int64)
@@ -28,7 +28,7 @@ def cells_around(top: Int32s, origin: Ints, slots: Int32s, x: int, y: int, z: in
     return found[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def mean_shift_across(
     points: Floats,
     directions: Floats,
