@@ -1,8 +1,9 @@
 """Recordings (MCAP): read, write, recover and cut; nothing else in the method touches files."""
 
+from canopy_skel.recording.decode import view_from_messages
 from canopy_skel.recording.encode import EncodedPicture, encode_view
 from canopy_skel.recording.options import ROS2_TOPICS, TopicOptions
-from canopy_skel.recording.reader import Recording, TopicSummary, read_recording
+from canopy_skel.recording.reader import Recording, TopicSummary, messages_of_view, read_recording
 from canopy_skel.recording.recover import RecoverReport, cut_recording, recover
 from canopy_skel.recording.writer import RecordingWriter
 
@@ -16,6 +17,8 @@ __all__ = [
     "TopicSummary",
     "cut_recording",
     "encode_view",
+    "messages_of_view",
     "read_recording",
     "recover",
+    "view_from_messages",
 ]

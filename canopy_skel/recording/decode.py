@@ -1,8 +1,8 @@
 """From the messages of one exposure to a View of a pinhole camera."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,14 @@ import numpy as np
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Float32Array, StereoPair, UInt16Array, View
 from canopy_skel.geometry import FloatArray, transform_from
-from canopy_skel.messages import Decoder, Picture
+from canopy_skel.messages import (
+    TOPICS,
+    Decoder,
+    FoxgloveDecoder,
+    Message,
+    Picture,
+    StampedTransform,
+)
 from canopy_skel.pixels import as_depth_m, as_instances, as_mono, as_rgb
 from canopy_skel.recording.options import TopicOptions
 from canopy_skel.recording.rectify import Rectification, rectification
@@ -19,6 +26,7 @@ from canopy_skel.recording.transforms import TransformBuffer
 _Side = Literal["color", "left", "right"]
 _PAIR_ROLES = ("left_image", "right_image", "left_calibration", "right_calibration")
 _SAME_CAMERA_PX = 0.05
+_CANOPY_TOPICS = TopicOptions()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,6 +64,68 @@ def decode_view(
         ViewError: something is missing or wrong; the text names view, topic and mend.
     """
     return _Exposure(index, parts, transforms, options, decoders).view()
+
+
+def view_from_messages(messages: Sequence[Message], options: TopicOptions = _CANOPY_TOPICS) -> View:
+    """Return the view that the messages of one exposure hold, without the rest of the recording.
+
+    It is the View that `read_recording` gives for these messages, as long as they carry their own
+    calibration, pose and hand-eye transform (RecordingWriter.write_view takes care of that) and no
+    two views of the scan have the same stamp.
+
+    Args:
+        messages: all of one view, as RecordingWriter.write_view or messages_of_view returned them.
+        options: names of topics and frames.
+
+    Raises:
+        ViewError: something is missing or wrong; the text names view, topic and mend.
+    """
+    indices = sorted({message.sequence for message in messages})
+    if len(indices) != 1:
+        raise ViewError(
+            f"the messages are of views {indices}, not of one view; give those of one `sequence`"
+        )
+    parts: dict[str, Part] = {}
+    transforms: list[StampedTransform] = []
+    decoder = FoxgloveDecoder()
+    for message in messages:
+        role = options.role_of(message.topic)
+        if role is None or message.topic not in TOPICS:
+            continue
+        part = _part(message)
+        if role == "transforms":
+            transforms.extend(_transforms(part, decoder))
+        else:
+            parts.setdefault(role, part)
+    return decode_view(
+        indices[0],
+        parts,
+        transforms=TransformBuffer(
+            transforms, tool_frame=options.tool_frame, max_gap_ns=options.max_pose_gap_ns
+        ),
+        options=options,
+        decoders={"protobuf": decoder, "json": decoder},
+    )
+
+
+def _part(message: Message) -> Part:
+    topic = TOPICS[message.topic]
+    return Part(
+        topic=topic.name,
+        schema=topic.schema,
+        encoding=topic.message_encoding,
+        log_time_ns=message.stamp_ns,
+        data=message.data,
+    )
+
+
+def _transforms(part: Part, decoder: Decoder) -> list[StampedTransform]:
+    """Return the transforms of a message; none of bytes that are no message, as readers do."""
+    try:
+        decoded = decoder.transforms(part.schema, part.data)
+    except ValueError:
+        return []  # the pose is looked up next, and missed by name
+    return [one if one.stamp_ns else replace(one, stamp_ns=part.log_time_ns) for one in decoded]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from canopy_skel.document import RejectedView
-from canopy_skel.errors import RecordingError, ViewError
+from canopy_skel.errors import RecordingError, UsageError, ViewError
 from canopy_skel.frame import View
-from canopy_skel.messages import Decoder, FoxgloveDecoder, StampedTransform
+from canopy_skel.messages import TOPICS, Decoder, FoxgloveDecoder, Message, StampedTransform
 from canopy_skel.recording.decode import Part, decode_view
 from canopy_skel.recording.grouping import (
     Group,
@@ -154,6 +154,38 @@ def read_recording(path: str | Path, topics: TopicOptions | None = None) -> Reco
         groups=tuple(groups),
         transforms=transforms,
     )
+
+
+def messages_of_view(recording: Recording, index: int) -> tuple[Message, ...]:
+    """Return the messages of one view, in the order and with the bytes they were recorded with.
+
+    The file may be a `.part` that is still being written: what was complete when read_recording
+    looked through it is found; nothing is locked or changed.
+
+    Raises:
+        UsageError: there was no view with this index then, or it was lost in part.
+        RecordingError: the file has changed or vanished since it was looked through.
+    """
+    group = next((one for one in recording.groups if one.index == index), None)
+    if group is None or group.partial:
+        has = ", ".join(str(one.index) for one in recording.groups if not one.partial)
+        raise UsageError(f"{recording.path}: no whole view {index}; it has {has or 'none'}")
+    file, reader = recording.file, MessageReader(recording.file)
+    names = {one.id: one.topic for one in file.channels.values()}
+    return tuple(
+        Message(
+            topic=names[ref.channel_id],
+            stamp_ns=ref.log_time_ns,
+            sequence=ref.sequence,
+            data=reader.read(ref),
+        )
+        for ref in file.messages
+        if ref.sequence == index and _belongs_to_views(names.get(ref.channel_id), recording.options)
+    )
+
+
+def _belongs_to_views(topic: str | None, options: TopicOptions) -> bool:
+    return topic in TOPICS and options.role_of(str(topic)) is not None
 
 
 def summarise_topics(file: McapFile) -> tuple[TopicSummary, ...]:
