@@ -57,11 +57,11 @@ class LiveSkeleton:
         here = (self._scan_id, self._segmenter, self._skeletonizer.config)
         return here == (envelope.scan_id, envelope.segmenter, envelope.config)
 
-    def add(self, envelope: ViewEnvelope) -> bool:
-        """Take in a view, or remember why it cannot be used; return whether anything changed."""
+    def add(self, envelope: ViewEnvelope) -> None:
+        """Take in a view, or remember why it cannot be used; a known one changes nothing."""
         index = envelope.view
         if index in self._rejected or index in self.views:
-            return False
+            return
         try:
             with self._stage("read"):
                 view = view_from_messages(envelope.messages)
@@ -70,7 +70,6 @@ class LiveSkeleton:
             self._skeletonizer.add_view(view)
         except CanopyError as error:
             self.reject(index, str(error))
-        return True
 
     def reject(self, index: int, reason: str) -> None:
         """Remember a view as unusable."""

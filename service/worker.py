@@ -19,6 +19,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import NoReturn
 
 import zenoh
@@ -99,7 +100,7 @@ class Worker:
         while True:
             data = self._inbox.get()
             self._in_hand = True
-            self._guarded(lambda data=data: self._take(data))  # type: ignore[misc]
+            self._guarded(partial(self._take, data))
             if self._inbox.empty() or time.monotonic() >= self._patient_until_s:
                 self._guarded(self._publish)
             self._in_hand = False
@@ -140,6 +141,7 @@ class Worker:
             scan = LiveSkeleton(scan_id, envelope.config, envelope.segmenter, self._stage)
             self._scans[scan_id] = scan
             self._forget(scan_id)
+            self._heartbeat = replace(self._heartbeat, problem="")
         self._scans.move_to_end(scan_id)
         while len(self._scans) > SCANS_KEPT:
             self._forget(self._scans.popitem(last=False)[0])

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, suppress
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,7 @@ class Rig:
         self.documents = []
         self._stack = ExitStack()
         self._workers = []
+        self._numbers = count(1)
 
     def __enter__(self):
         self.session = self._stack.enter_context(open_session(listen=self.endpoint))
@@ -94,8 +96,10 @@ class Rig:
     def log(self):
         return (self.folder / "worker.log").read_text()
 
-    def scan(self, name="scan-1", **changes):
-        """Begin a scan and return the writer of its recording, not yet entered."""
+    def scan(self, **changes):
+        """Begin a further scan and return the writer of its recording, not yet entered."""
+        self.scan_id = name = f"scan-{next(self._numbers)}"
+        self.documents.clear()
         path = self.folder / f"{name}.mcap"
         part = path.with_name(path.name + ".part")
         source = {
@@ -107,8 +111,9 @@ class Rig:
         self.feeder.begin(ScanSource(**(source | changes)))
         return RecordingWriter(path, {"scan_id": name}, tool_from_camera=np.eye(4))
 
-    def replayed(self, name="scan-1", config=None):
-        """Return the bytes that a replay of the recording gives."""
+    def replayed(self, config=None):
+        """Return the bytes that a replay of the last recording gives."""
+        name = self.scan_id
         request = ReplayRequest(
             config=config or MethodConfig(),
             segmenter="recorded",

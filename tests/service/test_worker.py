@@ -11,10 +11,15 @@ import zenoh
 from scenes.bus import ROOT, Rig, listening_addresses, scan_views, wait_for
 
 from canopy_skel.document import from_json
+from canopy_skel.errors import UsageError
 from canopy_skel.likelihood import LikelihoodConfig
 from canopy_skel.pipeline import MethodConfig
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+from service.bus import open_session
 from service.envelope import ViewEnvelope, encode_envelope
 from service.feeder import ViewFeeder
+from service.skeletons import SEGMENTERS
+from service.worker import Worker
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +34,15 @@ def rig(tmp_path):
         yield rig
 
 
+@pytest.fixture(scope="module")
+def lasting(tmp_path_factory):
+    """A rig whose worker outlives test after test."""
+    with Rig(tmp_path_factory.mktemp("rig")) as rig:
+        rig.worker = rig.start_ready_worker()
+        yield rig
+        assert rig.worker.poll() is None
+
+
 def record(rig, writer, views):
     """Write views and offer them, as a scan does."""
     for view in views:
@@ -37,39 +51,38 @@ def record(rig, writer, views):
 
 
 def arrived(rig):
-    """How many views the workers have used or rejected."""
-    seen = rig.feeder.workers()
-    return max((len(one.heartbeat.views) + len(one.heartbeat.rejected) for one in seen), default=0)
+    """How many views of the scan a worker has used or rejected."""
+    beats = [one.heartbeat for one in rig.feeder.workers()]
+    scan = [one for one in beats if one.scan_id == rig.scan_id]
+    return max((len(one.views) + len(one.rejected) for one in scan), default=0)
 
 
-def finish(rig, name="scan-1", **replay):
+def finish(rig, **replay):
     """Wait for the last skeleton and compare it with a replay of the recording."""
     assert rig.feeder.flush(20)
-    document = rig.feeder.latest_skeleton(name)
-    assert document == rig.replayed(name, **replay)
+    document = rig.feeder.latest_skeleton(rig.scan_id)
+    assert document == rig.replayed(**replay)
     return from_json(document)
 
 
-def test_a_live_scan_gives_the_bytes_of_its_replay(rig, views):
-    rig.start_ready_worker()
-    with rig.scan() as writer:
+def test_a_live_scan_gives_the_bytes_of_its_replay(lasting, views):
+    with lasting.scan() as writer:
         for view in views:
-            record(rig, writer, [view])
-            assert rig.feeder.flush(10)
-    document = finish(rig)
+            record(lasting, writer, [view])
+            assert lasting.feeder.flush(10)
+    document = finish(lasting)
     assert (document.views_used, [one.index for one in document.views_rejected]) == (9, [6])
-    published = [from_json(data) for _, data in rig.documents]
+    published = [from_json(data) for _, data in lasting.documents]
     assert [one.revision for one in published] == [1, 2, 3, 4, 5, 6, 6, 7, 8, 9]
-    assert {scan_id for scan_id, _ in rig.documents} == {"scan-1"}
-    assert rig.feeder.worker_status().ready
+    assert {scan_id for scan_id, _ in lasting.documents} == {lasting.scan_id}
+    assert lasting.feeder.worker_status().ready
 
 
-def test_method_and_segmenter_of_the_scan_reach_the_worker(rig, views):
-    rig.start_ready_worker()
+def test_method_and_segmenter_of_the_scan_reach_the_worker(lasting, views):
     config = MethodConfig(name="ftsem", likelihood=LikelihoodConfig(voxel_size_m=0.01))
-    with rig.scan(config=config) as writer:
-        record(rig, writer, views)
-    assert finish(rig, config=config).method.config_sha256 == config.sha256()
+    with lasting.scan(config=config) as writer:
+        record(lasting, writer, views)
+    assert finish(lasting, config=config).method.config_sha256 == config.sha256()
 
 
 @pytest.mark.parametrize("k", [1, 5, 10])
@@ -104,17 +117,17 @@ def test_a_worker_that_starts_after_the_scan_gets_all_of_it(rig, views):
     assert not status.ready
     assert "no worker has reported yet" in status.detail
     assert not rig.feeder.flush(0.2)
+    assert list(rig.session.get(rig.keys.skeleton(rig.scan_id), timeout=1)) == []
     rig.start_worker()
     finish(rig)
 
 
-def test_order_and_repetition_of_views_do_not_matter(rig, views):
-    worker = rig.start_ready_worker()
-    with rig.scan() as writer:
+def test_order_and_repetition_of_views_do_not_matter(lasting, views):
+    with lasting.scan() as writer:
         envelopes = [
             encode_envelope(
                 ViewEnvelope(
-                    scan_id="scan-1",
+                    scan_id=lasting.scan_id,
                     view=view.index,
                     config=MethodConfig(),
                     segmenter="recorded",
@@ -126,12 +139,13 @@ def test_order_and_repetition_of_views_do_not_matter(rig, views):
     shuffled = envelopes * 3
     random.Random(4).shuffle(shuffled)
     for data in shuffled:
-        rig.session.put(
-            rig.keys.view("scan-1"), data, congestion_control=zenoh.CongestionControl.BLOCK
+        lasting.session.put(
+            lasting.keys.view(lasting.scan_id),
+            data,
+            congestion_control=zenoh.CongestionControl.BLOCK,
         )
-    wait_for(lambda: arrived(rig) == 10)
-    finish(rig)
-    assert worker.poll() is None
+    wait_for(lambda: arrived(lasting) == 10)
+    finish(lasting)
 
 
 class Lossy:
@@ -180,71 +194,96 @@ def test_a_stalled_worker_loses_nothing_and_holds_nobody_up(rig, views):
     assert slowest_s < 0.05
 
 
-def test_the_latest_skeleton_can_be_asked_for(rig, views):
-    assert list(rig.session.get(rig.keys.skeleton("scan-1"), timeout=1)) == []
-    rig.start_ready_worker()
-    with rig.scan() as writer:
-        record(rig, writer, views[:3])
-    finish(rig)
-    (reply,) = rig.session.get(rig.keys.skeleton("scan-1"), timeout=5)
-    assert reply.ok.payload.to_bytes() == rig.feeder.latest_skeleton("scan-1")
+def test_the_latest_skeleton_can_be_asked_for(lasting, views):
+    with lasting.scan() as writer:
+        record(lasting, writer, views[:3])
+    finish(lasting)
+    (reply,) = lasting.session.get(lasting.keys.skeleton(lasting.scan_id), timeout=5)
+    assert reply.ok.payload.to_bytes() == lasting.feeder.latest_skeleton(lasting.scan_id)
     assert str(reply.ok.encoding) == "application/json"
     assert json.loads(reply.ok.attachment.to_bytes())["revision"] == 3
-    (unknown,) = rig.session.get(rig.keys.skeleton("scan-9"), timeout=5)
+    (unknown,) = lasting.session.get(lasting.keys.skeleton("nobody's"), timeout=5)
     assert str(unknown.err.encoding) == "application/problem+json"
     problem = json.loads(unknown.err.payload.to_bytes())
     assert problem["status"] == 404
-    assert rig.keys.skeleton("scan-9") in problem["detail"]
+    assert lasting.keys.skeleton("nobody's") in problem["detail"]
 
 
-def test_a_service_that_starts_later_learns_the_latest_skeleton(rig, views):
-    rig.start_ready_worker()
-    with rig.scan() as writer:
-        record(rig, writer, views[:3])
-    finish(rig)
-    with ViewFeeder(rig.session, rig.keys) as later:
-        wait_for(lambda: later.latest_skeleton("scan-1"), 5)
-        assert later.latest_skeleton("scan-1") == rig.feeder.latest_skeleton("scan-1")
+def test_a_service_that_starts_later_learns_the_latest_skeleton(lasting, views):
+    with lasting.scan() as writer:
+        record(lasting, writer, views[:3])
+    finish(lasting)
+    with ViewFeeder(lasting.session, lasting.keys) as later:
+        wait_for(lambda: later.latest_skeleton(lasting.scan_id), 5)
+        assert later.latest_skeleton(lasting.scan_id) == lasting.feeder.latest_skeleton(
+            lasting.scan_id
+        )
 
 
-def test_a_bad_sample_is_said_and_survived(rig, views):
-    worker = rig.start_ready_worker()
+def test_a_bad_sample_is_said_and_survived(lasting, views):
     for bad in (b"", b"hello", b"canopy-view/1\n\xff\xff\xff\xff", b"canopy-view/9\n"):
-        rig.session.put(rig.keys.view("scan-1"), bad)
-    wait_for(lambda: "canopy-view/9" in rig.feeder.worker_status().detail, 5)
-    with rig.scan() as writer:
-        record(rig, writer, views)
-    finish(rig)
-    assert worker.poll() is None
+        lasting.session.put(lasting.keys.view("scan-0"), bad)
+    wait_for(lambda: "canopy-view/9" in lasting.feeder.worker_status().detail, 5)
+    with lasting.scan() as writer:
+        record(lasting, writer, views)
+    finish(lasting)
 
 
-def test_a_segmenter_that_is_not_there_is_said(rig, views):
-    rig.start_ready_worker()
-    with rig.scan(segmenter="eyes") as writer:
-        record(rig, writer, views[:1])
+class BreaksAtViewOne:
+    """A segmenter with a fault of its own."""
+
+    def segment(self, view):
+        if view.index == 1:
+            raise RuntimeError("weights are torn")
+        return RecordedSegmenter().segment(view)
+
+
+def test_a_fault_of_the_method_costs_one_view(rig, views, monkeypatch):
+    monkeypatch.setitem(SEGMENTERS, "fragile", BreaksAtViewOne)
+    with (
+        open_session(connect=rig.endpoint) as session,
+        Worker(session, rig.keys, "in-process").running(),
+        rig.scan(segmenter="fragile") as writer,
+    ):
+        record(rig, writer, views[:4])
+        assert rig.feeder.flush(20)
+        document = from_json(rig.feeder.latest_skeleton(rig.scan_id))
+        assert "weights are torn" in rig.feeder.worker_status().detail
+    (rejected,) = document.views_rejected
+    assert (document.views_used, rejected.index) == (3, 1)
+    assert rejected.reason == "view 1: the method failed on it (RuntimeError('weights are torn'))"
+
+
+def test_a_view_without_a_scan_is_refused(rig):
+    with pytest.raises(UsageError, match="view 0 is of no scan; begin one first"):
+        rig.feeder.offer(0)
+
+
+def test_a_segmenter_that_is_not_there_is_said(lasting, views):
+    with lasting.scan(segmenter="eyes") as writer:
+        record(lasting, writer, views[:1])
     says = "unknown segmenter 'eyes': choose one of recorded"
-    wait_for(lambda: says in rig.feeder.worker_status().detail, 5)
-    assert rig.feeder.latest_skeleton("scan-1") is None
+    wait_for(lambda: says in lasting.feeder.worker_status().detail, 5)
+    assert lasting.feeder.latest_skeleton(lasting.scan_id) is None
 
 
-def test_scans_come_one_after_the_other_and_the_last_two_are_kept(rig, views):
-    rig.start_ready_worker()
-    names = ("scan-1", "scan-2", "scan-3")
-    for count, name in enumerate(names, start=2):
-        with rig.scan(name) as writer:
-            record(rig, writer, views[:count])
-        assert finish(rig, name).views_used == count
-    replies = list(rig.session.get(rig.keys.skeletons, timeout=5))
-    assert sorted(str(one.ok.key_expr) for one in replies) == [
-        rig.keys.skeleton(name) for name in names[1:]
-    ]
+def test_scans_come_one_after_the_other_and_the_last_two_are_kept(lasting, views):
+    names = []
+    for count in (2, 3, 4):
+        with lasting.scan() as writer:
+            record(lasting, writer, views[:count])
+        assert finish(lasting).views_used == count
+        names.append(lasting.scan_id)
+    replies = list(lasting.session.get(lasting.keys.skeletons, timeout=5))
+    expected = {lasting.keys.skeleton(name) for name in names[1:]}
+    assert {str(one.ok.key_expr) for one in replies} == expected
 
 
-def test_a_worker_listens_nowhere(rig):
-    worker = rig.start_ready_worker()
-    assert listening_addresses(worker.pid) == []
-    (service,) = listening_addresses(os.getpid())
-    assert f"tcp/{service[0]}:{service[1]}" == rig.endpoint
+def test_a_worker_listens_nowhere(lasting):
+    assert listening_addresses(lasting.worker.pid) == []
+    service = {f"tcp/{address}:{port}" for address, port in listening_addresses(os.getpid())}
+    assert lasting.endpoint in service
+    assert all(endpoint.startswith("tcp/127.") for endpoint in service)
 
 
 def test_a_worker_leaves_at_once_when_it_is_told(rig, views):
