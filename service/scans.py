@@ -26,6 +26,7 @@ from service.rig import (
 from service.specs import fields_of, spec_from
 
 logger = logging.getLogger(__name__)
+_JOURNAL_TIMEOUT_S = 1.0
 
 
 class KeyReusedError(Exception):
@@ -66,9 +67,9 @@ class Scans:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Note what is still to be noted."""
+        """Note what is still to be noted, unless the rig holds it up."""
         self._events.put(None)
-        self._journal.join()
+        self._journal.join(_JOURNAL_TIMEOUT_S)
 
     def start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
         """Start a scan and return its status fields; once for each key, whatever happens.
