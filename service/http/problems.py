@@ -15,7 +15,7 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from canopy_skel.errors import UsageError
+from canopy_skel.errors import RecordingError, UsageError
 from service.http.requests import UnknownPathError
 from service.rig import PlanRefusedError, RigBusyError, RigError, RigNotReadyError, UnknownScanError
 from service.scans import KeyReusedError, ScanOverError
@@ -34,6 +34,7 @@ _KNOWN: Mapping[type[Exception], tuple[int, str, str]] = {
     UnknownPathError: (422, "unknown_path", "No such path"),
     KeyReusedError: (422, "idempotency_key_reused", "Idempotency-Key used for another request"),
     UsageError: (422, "bad_argument", "An argument does not fit"),
+    RecordingError: (503, "recording_failed", "The recording cannot be used"),
     RigNotReadyError: (503, "rig_not_ready", "Arm or camera cannot be used now"),
     RigError: (503, "rig_error", "The rig could not do it"),
 }

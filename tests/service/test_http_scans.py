@@ -11,7 +11,7 @@ from fake_rig import FakeRig
 from live_service import BODY, PATHS, problem, serving
 
 from service.http.requests import SpeedCaps
-from service.rig import RigNotReadyError
+from service.rig import RigNotReadyError, ScanState
 
 
 def test_a_scan_is_accepted_and_can_be_looked_at(live):
@@ -233,6 +233,26 @@ def test_pages_of_other_sites_cannot_command_the_rig_but_may_stop_it(live):
     assert live.rig.stops == 1
 
 
+def test_a_scan_can_be_cancelled_while_it_starts(live, monkeypatch):
+    begun, gate, start = threading.Event(), threading.Event(), live.rig.start
+
+    def slow_start(spec):
+        begun.set()
+        gate.wait(10)
+        return start(spec)
+
+    monkeypatch.setattr(live.rig, "start", slow_start)
+    starting = threading.Thread(target=live.post_scan)
+    starting.start()
+    assert begun.wait(5)
+    [scan] = live.http.get("/v1/scans").json()["scans"]
+    threading.Timer(0.3, gate.set).start()
+    answer = live.http.post(f"/v1/scans/{scan['scan_id']}:cancel")
+    starting.join()
+    assert answer.json()["state"] == "cancelled"
+    assert live.rig.status(scan["scan_id"]).state is ScanState.CANCELLED
+
+
 def test_stop_and_acknowledge(live):
     assert [live.http.post("/v1/rig:stop").status_code for _ in range(2)] == [200, 200]
     assert live.rig.stops == 2
@@ -281,6 +301,18 @@ def test_a_catalogue_that_cannot_be_written_moves_nothing(tmp_path):
             other.execute("DROP TABLE idempotency")
         problem(live.post_scan(), 503, "catalogue_unavailable")
         assert not live.rig.specs
+
+
+def test_the_arm_is_commanded_even_if_the_catalogue_cannot_be_written(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        with closing(sqlite3.connect(tmp_path / "catalogue.sqlite")) as other:
+            other.execute(
+                "CREATE TRIGGER full BEFORE UPDATE ON scans BEGIN SELECT no_such_function(); END"
+            )
+        assert live.http.post(f"/v1/scans/{scan_id}:pause").json()["state"] == "paused"
+        assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "paused"
+        assert live.rig.status(scan_id).state is ScanState.PAUSED
 
 
 def test_readiness_names_what_is_missing(live):
