@@ -74,11 +74,11 @@ class RevisionRecord:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class UsedKey:
-    """What an idempotency key was used for."""
+    """What an idempotency key was used for, and the answer then."""
 
     body_sha256: str
     scan_id: str
-    response: Mapping[str, Any] | None
+    response: Mapping[str, Any]
 
 
 class Catalogue:
@@ -145,9 +145,14 @@ class Catalogue:
         return list(left)
 
     def add_scan(
-        self, status: ScanStatus, request: Mapping[str, Any], key: str, body_sha256: str
+        self,
+        status: ScanStatus,
+        request: Mapping[str, Any],
+        key: str,
+        body_sha256: str,
+        response: Mapping[str, Any],
     ) -> None:
-        """Note a scan that is about to start, together with the key that asked for it."""
+        """Note a scan that is about to start, the key that asked for it, and the answer."""
         now_ns = time.time_ns()
         with self.transaction() as connection:
             connection.execute(
@@ -160,7 +165,11 @@ class Catalogue:
             )
             connection.execute(
                 IDEMPOTENCY.insert().values(
-                    key=key, body_sha256=body_sha256, scan_id=status.scan_id, created_ns=now_ns
+                    key=key,
+                    body_sha256=body_sha256,
+                    scan_id=status.scan_id,
+                    response=response,
+                    created_ns=now_ns,
                 )
             )
 
@@ -179,21 +188,15 @@ class Catalogue:
             return None
         return UsedKey(body_sha256=row.body_sha256, scan_id=row.scan_id, response=row.response)
 
-    def keep_response(self, key: str, response: Mapping[str, Any]) -> None:
-        """Keep the answer that a repeated request with this key gets."""
-        with self.transaction() as connection:
-            connection.execute(
-                IDEMPOTENCY.update().where(IDEMPOTENCY.c.key == key).values(response=response)
-            )
-
-    def update(self, status: ScanStatus, recording: Path | None = None) -> bool:
-        """Note where a scan is now; say whether the catalogue has it."""
+    def update(self, status: ScanStatus, recording: Path | None = None) -> None:
+        """Note where a scan is now."""
         values = _status_values(status) | {"updated_ns": time.time_ns()}
         if recording is not None:
             values["recording"] = str(recording)
         with self.transaction() as connection:
-            statement = SCANS.update().where(SCANS.c.scan_id == status.scan_id).values(values)
-            return connection.execute(statement).rowcount == 1
+            connection.execute(
+                SCANS.update().where(SCANS.c.scan_id == status.scan_id).values(values)
+            )
 
     def scan(self, scan_id: str) -> ScanRecord | None:
         """Return a scan, None if there is none of this id."""

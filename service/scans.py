@@ -11,6 +11,8 @@ from threading import Lock, Thread
 from types import TracebackType
 from typing import Any, Self
 
+from sqlalchemy.exc import OperationalError
+
 from service.bell import Bell
 from service.catalogue import Catalogue, ScanRecord
 from service.rig import (
@@ -26,6 +28,7 @@ from service.rig import (
 from service.specs import fields_of, spec_from
 
 logger = logging.getLogger(__name__)
+_JOURNAL_TIMEOUT_S = 1.0
 
 
 class KeyReusedError(Exception):
@@ -66,9 +69,9 @@ class Scans:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Note what is still to be noted."""
+        """Note what is still to be noted, unless the rig holds it up."""
         self._events.put(None)
-        self._journal.join()
+        self._journal.join(_JOURNAL_TIMEOUT_S)
 
     def start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
         """Start a scan and return its status fields; once for each key, whatever happens.
@@ -86,7 +89,7 @@ class Scans:
                 return self._start(spec, key, body_sha256)
         if used.body_sha256 != body_sha256:
             raise KeyReusedError(f"this Idempotency-Key was used for scan {used.scan_id}")
-        return used.response or status_fields(self.status(used.scan_id))
+        return used.response
 
     def _start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
         status = ScanStatus(
@@ -96,9 +99,10 @@ class Scans:
             views_done=0,
             views_total=len(spec.waypoints),
         )
-        self.catalogue.add_scan(status, fields_of(spec), key, body_sha256)
+        answer = status_fields(status)
+        self.catalogue.add_scan(status, fields_of(spec), key, body_sha256, answer)
         try:
-            answer = status_fields(self._rig.start(spec))
+            self._rig.start(spec)
         except RigError:
             self.catalogue.drop_scan(spec.scan_id)
             raise
@@ -107,7 +111,6 @@ class Scans:
             self.catalogue.update(failed)
             raise
         self._refresh(spec.scan_id)
-        self.catalogue.keep_response(key, answer)
         return answer
 
     def record(self, scan_id: str) -> ScanRecord:
@@ -176,26 +179,51 @@ class Scans:
         without_rig: Callable[[ScanRecord], ScanStatus],
     ) -> ScanStatus:
         """Have the rig do it; do it without where only the catalogue knows the scan."""
-        record = self.record(scan_id)
-        if record.state in FINISHED:
-            raise ScanOverError(f"scan {scan_id} is {record.state.value}; start a new one")
+        self._require_unfinished(scan_id)
         try:
             status = ask_rig(scan_id)
         except UnknownScanError:
-            status = without_rig(record)
-            self.catalogue.update(status)
+            status = self._command_settled(scan_id, ask_rig, without_rig)
         self._refresh(scan_id)
         self._bell.ring()
         return status
 
+    def _command_settled(
+        self,
+        scan_id: str,
+        ask_rig: Callable[[str], ScanStatus],
+        without_rig: Callable[[ScanRecord], ScanStatus],
+    ) -> ScanStatus:
+        """Ask once more when no start is under way: the rig may only just be learning of it."""
+        with self._starting:
+            record = self._require_unfinished(scan_id)
+            try:
+                return ask_rig(scan_id)
+            except UnknownScanError:
+                status = without_rig(record)
+                self.catalogue.update(status)
+                return status
+
+    def _require_unfinished(self, scan_id: str) -> ScanRecord:
+        record = self.record(scan_id)
+        if record.state in FINISHED:
+            raise ScanOverError(f"scan {scan_id} is {record.state.value}; start a new one")
+        return record
+
     def _refresh(self, scan_id: str) -> ScanStatus:
-        """Note where a scan is; the lock keeps an older answer from overwriting a newer one."""
+        """Note where a scan is; the lock keeps an older answer from overwriting a newer one.
+
+        That it cannot be noted does not undo what the arm has done, so it is no error.
+        """
         with self._refreshing:
             try:
                 status = self._rig.status(scan_id)
-                self.catalogue.update(status, self._recording_path(scan_id))
             except UnknownScanError:
-                status = self.record(scan_id).status
+                return self.record(scan_id).status
+            try:
+                self.catalogue.update(status, self._recording_path(scan_id))
+            except OperationalError:
+                logger.exception("status not noted scan_id=%s", scan_id)
         return status
 
     def _recording_path(self, scan_id: str) -> Path | None:

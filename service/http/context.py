@@ -28,7 +28,7 @@ class Context:
     caps: SpeedCaps
 
 
-def _context(request: Request) -> Context:
+async def _context(request: Request) -> Context:
     context: Context = request.app.state.context
     return context
 
@@ -36,7 +36,15 @@ def _context(request: Request) -> Context:
 Here = Annotated[Context, Depends(_context)]
 
 
-def refuse_foreign_pages(request: Request) -> None:
+def known_scan(scan_id: str, here: Here) -> str:
+    """Return the id of a scan that there is; UnknownScanError otherwise."""
+    return here.scans.record(scan_id).scan_id
+
+
+KnownScan = Annotated[str, Depends(known_scan)]
+
+
+async def refuse_foreign_pages(request: Request) -> None:
     """Refuse what a web page of another site makes a browser send: it must not move the arm."""
     origin = request.headers.get("origin")
     if origin is not None and urlsplit(origin).netloc != request.headers.get("host"):

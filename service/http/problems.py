@@ -11,12 +11,13 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
+from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from canopy_skel.errors import UsageError
+from canopy_skel.errors import RecordingError, UsageError
 from service.http.requests import UnknownPathError
-from service.rig import PlanRefusedError, RigBusyError, RigNotReadyError, UnknownScanError
+from service.rig import PlanRefusedError, RigBusyError, RigError, RigNotReadyError, UnknownScanError
 from service.scans import KeyReusedError, ScanOverError
 
 logger = logging.getLogger(__name__)
@@ -33,7 +34,9 @@ _KNOWN: Mapping[type[Exception], tuple[int, str, str]] = {
     UnknownPathError: (422, "unknown_path", "No such path"),
     KeyReusedError: (422, "idempotency_key_reused", "Idempotency-Key used for another request"),
     UsageError: (422, "bad_argument", "An argument does not fit"),
+    RecordingError: (503, "recording_failed", "The recording cannot be used"),
     RigNotReadyError: (503, "rig_not_ready", "Arm or camera cannot be used now"),
+    RigError: (503, "rig_error", "The rig could not do it"),
 }
 
 
@@ -81,6 +84,7 @@ def add_handlers(app: FastAPI) -> None:
     """Have every error of the app answered as a problem."""
     for kind in _KNOWN:
         app.add_exception_handler(kind, _known)
+    app.add_exception_handler(OperationalError, _catalogue_fails)
     app.add_exception_handler(Problem, _problem)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _of_framework)
@@ -116,6 +120,13 @@ def _known(request: Request, error: Exception) -> JSONResponse:
 def refused_waypoints(error: PlanRefusedError) -> list[dict[str, Any]]:
     """Return the waypoints that cannot be driven to, with the reason of each."""
     return [{"index": v.index, "reason": v.reason} for v in error.verdicts if not v.reachable]
+
+
+def _catalogue_fails(request: Request, error: Exception) -> JSONResponse:
+    logger.error("catalogue fails", exc_info=error)
+    title = "The catalogue cannot be used"
+    mend = "free space on the disk of the service's state folder, and check that it is writable"
+    return answer(request, Problem(503, "catalogue_unavailable", title, mend))
 
 
 def _invalid(request: Request, error: Exception) -> JSONResponse:

@@ -1,5 +1,6 @@
 """Routes of the rig: is it ready, stop it, let it move again, what could it drive."""
 
+import asyncio
 from typing import Any
 
 from fastapi import APIRouter, Depends
@@ -47,9 +48,9 @@ def show_rig(here: Here) -> dict[str, Any]:
 
 
 @router.post("/v1/rig:stop")
-def stop(here: Here) -> dict[str, str]:
+async def stop(here: Here) -> dict[str, str]:
     """Stop the arm now; no condition, never queued, harmless when repeated."""
-    here.rig.stop()
+    await asyncio.to_thread(here.rig.stop)  # not in the pool that other requests may fill
     return {"status": "stopped"}
 
 

@@ -12,7 +12,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.bell import wait_for_ring
 from service.catalogue import EventRecord, ScanRecord
-from service.http.context import Context, Here, refuse_foreign_pages
+from service.http.context import Context, Here, KnownScan, refuse_foreign_pages
 from service.http.problems import Problem
 from service.http.requests import ScanBody, scan_spec
 from service.pictures import NoPictureError, PictureKind, recorded_file
@@ -95,14 +95,6 @@ def resume_scan(scan_id: str, here: Here) -> dict[str, Any]:
 def cancel_scan(scan_id: str, here: Here) -> dict[str, Any]:
     """Stop the arm and end the scan; its recording stays."""
     return status_fields(here.scans.cancel(scan_id))
-
-
-def known_scan(scan_id: str, here: Here) -> str:
-    """Return the id of a scan that there is."""
-    return here.scans.record(scan_id).scan_id
-
-
-KnownScan = Annotated[str, Depends(known_scan)]
 
 
 @router.get("/{scan_id}/events", response_class=EventSourceResponse)

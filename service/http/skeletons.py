@@ -14,10 +14,9 @@ from canopy_skel.exports import FORMATS
 from canopy_skel.schema import schema_text
 from service.bell import wait_for_ring
 from service.catalogue import RevisionRecord
-from service.http.context import Context, Here
+from service.http.context import Context, Here, KnownScan
 from service.http.negotiation import best_media_type, matches, wait_s
 from service.http.problems import Problem
-from service.http.scans import KnownScan
 
 router = APIRouter(tags=["skeletons"])
 

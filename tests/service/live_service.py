@@ -90,6 +90,20 @@ def skeleton(scan_id: str, revision: int, length_m: float = 1.0) -> bytes:
     )
 
 
+def problem(answer, status, code):
+    """Check that an answer is a whole problem document and return it."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    body = answer.json()
+    assert body["status"] == status
+    assert body["code"] == code
+    assert body["type"] == f"urn:canopy:problem:{code}"
+    assert body["instance"] == answer.url.path
+    assert body["title"]
+    assert body["detail"]
+    return body
+
+
 def read_events(stream: httpx2.Response) -> Iterator[dict]:
     """Yield the events of an SSE stream as {"event", "id", "data"}."""
     fields: dict = {}

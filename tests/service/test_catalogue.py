@@ -57,14 +57,14 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
 
 def test_an_old_catalogue_opens_again(tmp_path):
     with Catalogue(tmp_path) as catalogue:
-        catalogue.add_scan(status(), {"a": [0.1]}, "k", "sha")
+        catalogue.add_scan(status(), {"a": [0.1]}, "k", "sha", {})
     with Catalogue(tmp_path) as catalogue:
         record = catalogue.scan("s1")
     assert (record.status, record.request) == (status(), {"a": [0.1]})
 
 
 def test_a_refused_scan_is_forgotten_with_its_key(catalogue):
-    catalogue.add_scan(status(), {}, "k", "sha")
+    catalogue.add_scan(status(), {}, "k", "sha", {})
     catalogue.add_event("s1", "started", {})
     catalogue.drop_scan("s1")
     assert catalogue.scan("s1") is None
@@ -73,21 +73,21 @@ def test_a_refused_scan_is_forgotten_with_its_key(catalogue):
 
 
 def test_a_key_is_free_after_a_day(catalogue, monkeypatch):
-    catalogue.add_scan(status("s1"), {}, "k", "sha")
+    catalogue.add_scan(status("s1"), {}, "k", "sha", {})
     assert catalogue.used_key("k").scan_id == "s1"
     now_ns = catalogue_module.time.time_ns()
     monkeypatch.setattr(
         catalogue_module.time, "time_ns", lambda: now_ns + catalogue_module.KEY_LIFETIME_NS + 10**9
     )
     assert catalogue.used_key("k") is None
-    catalogue.add_scan(status("s2"), {}, "k", "other")
+    catalogue.add_scan(status("s2"), {}, "k", "other", {})
     assert catalogue.used_key("k").scan_id == "s2"
 
 
 def test_recovery_stops_what_was_under_way_and_nothing_else(catalogue):
     states = list(ScanState)
     for state in states:
-        catalogue.add_scan(status(state.value, state), {}, f"k-{state}", "sha")
+        catalogue.add_scan(status(state.value, state), {}, f"k-{state}", "sha", {})
     assert sorted(catalogue.recover()) == ["paused", "running"]
     for state in states:
         record = catalogue.scan(state.value)
@@ -97,7 +97,7 @@ def test_recovery_stops_what_was_under_way_and_nothing_else(catalogue):
 
 
 def test_recovery_makes_revisions_and_files_agree(tmp_path, catalogue):
-    catalogue.add_scan(status(), {}, "k", "sha")
+    catalogue.add_scan(status(), {}, "k", "sha", {})
     for revision in (1, 2):
         assert catalogue.add_revision("s1", skeleton("s1", revision, length_m=revision))
     catalogue.newest_revision("s1").path.unlink()
@@ -117,7 +117,7 @@ from test_catalogue import status
 from service.catalogue import Catalogue
 
 with Catalogue(sys.argv[1]) as catalogue:
-    catalogue.add_scan(status(), {"a": 1}, "k", "sha")
+    catalogue.add_scan(status(), {"a": 1}, "k", "sha", {})
     for revision in range(1, 100000):
         document = skeleton("s1", revision, length_m=revision)
         catalogue.add_revision("s1", document)

@@ -1,27 +1,17 @@
 import json
+import sqlite3
 import threading
+import time
+from contextlib import closing
 
+import httpx2
 import numpy as np
 import pytest
 from fake_rig import FakeRig
-from live_service import BODY, PATHS, read_events, serving, skeleton
+from live_service import BODY, PATHS, problem, serving
 
 from service.http.requests import SpeedCaps
 from service.rig import RigNotReadyError, ScanState
-
-
-def problem(answer, status, code):
-    """Check that an answer is a whole problem document and return it."""
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    body = answer.json()
-    assert body["status"] == status
-    assert body["code"] == code
-    assert body["type"] == f"urn:canopy:problem:{code}"
-    assert body["instance"] == answer.url.path
-    assert body["title"]
-    assert body["detail"]
-    return body
 
 
 def test_a_scan_is_accepted_and_can_be_looked_at(live):
@@ -243,6 +233,26 @@ def test_pages_of_other_sites_cannot_command_the_rig_but_may_stop_it(live):
     assert live.rig.stops == 1
 
 
+def test_a_scan_can_be_cancelled_while_it_starts(live, monkeypatch):
+    begun, gate, start = threading.Event(), threading.Event(), live.rig.start
+
+    def slow_start(spec):
+        begun.set()
+        gate.wait(10)
+        return start(spec)
+
+    monkeypatch.setattr(live.rig, "start", slow_start)
+    starting = threading.Thread(target=live.post_scan)
+    starting.start()
+    assert begun.wait(5)
+    [scan] = live.http.get("/v1/scans").json()["scans"]
+    threading.Timer(0.3, gate.set).start()
+    answer = live.http.post(f"/v1/scans/{scan['scan_id']}:cancel")
+    starting.join()
+    assert answer.json()["state"] == "cancelled"
+    assert live.rig.status(scan["scan_id"]).state is ScanState.CANCELLED
+
+
 def test_stop_and_acknowledge(live):
     assert [live.http.post("/v1/rig:stop").status_code for _ in range(2)] == [200, 200]
     assert live.rig.stops == 2
@@ -253,6 +263,56 @@ def test_stop_and_acknowledge(live):
     live.rig.refusal = RigNotReadyError("still in protective stop; unlock it on the pendant")
     answer = live.http.post("/v1/rig:acknowledge", json={"reason": "branch removed"})
     assert "pendant" in problem(answer, 503, "rig_not_ready")["detail"]
+
+
+def test_stop_does_not_queue_behind_other_requests(live, monkeypatch):
+    gate, waiting = threading.Event(), threading.Semaphore(0)
+
+    def slow_plan(spec):
+        waiting.release()
+        gate.wait(10)
+        return []
+
+    monkeypatch.setattr(live.rig, "plan", slow_plan)
+    limits = httpx2.Limits(max_connections=None)
+    with httpx2.Client(base_url=live.url, timeout=15, limits=limits) as http:
+        body = {"path": "short"}
+        plans = [
+            threading.Thread(target=http.post, args=("/v1/plans",), kwargs={"json": body})
+            for _ in range(60)
+        ]
+        for thread in plans:
+            thread.start()
+        for _ in range(40):
+            assert waiting.acquire(timeout=5)
+        began_s = time.perf_counter()
+        assert live.http.post("/v1/rig:stop").status_code == 200
+        assert time.perf_counter() - began_s < 1
+        assert live.rig.stops == 1
+        gate.set()
+        for thread in plans:
+            thread.join(10)
+
+
+def test_a_catalogue_that_cannot_be_written_moves_nothing(tmp_path):
+    with serving(tmp_path) as live:
+        with closing(sqlite3.connect(tmp_path / "catalogue.sqlite")) as other:
+            other.execute("DROP TABLE events")
+            other.execute("DROP TABLE idempotency")
+        problem(live.post_scan(), 503, "catalogue_unavailable")
+        assert not live.rig.specs
+
+
+def test_the_arm_is_commanded_even_if_the_catalogue_cannot_be_written(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        with closing(sqlite3.connect(tmp_path / "catalogue.sqlite")) as other:
+            other.execute(
+                "CREATE TRIGGER full BEFORE UPDATE ON scans BEGIN SELECT no_such_function(); END"
+            )
+        assert live.http.post(f"/v1/scans/{scan_id}:pause").json()["state"] == "paused"
+        assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "paused"
+        assert live.rig.status(scan_id).state is ScanState.PAUSED
 
 
 def test_readiness_names_what_is_missing(live):
@@ -329,50 +389,3 @@ def test_a_scan_of_an_earlier_life_can_be_cancelled(tmp_path):
         answer = live.http.post(f"/v1/scans/{scan_id}:cancel")
         assert answer.json()["state"] == "cancelled"
         assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "cancelled"
-
-
-def test_events_come_live_and_end_with_the_scan(live):
-    scan_id = live.start()
-    received = []
-    with live.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
-        assert stream.headers["content-type"].startswith("text/event-stream")
-        for event in read_events(stream):
-            received.append(event)
-            if event["event"] == "started":
-                live.rig.photograph(scan_id, 0)
-            if event["event"] == "view":
-                live.rig.publish(scan_id, skeleton(scan_id, 1))
-            if event["event"] == "skeleton":
-                assert live.http.get(f"/v1/scans/{scan_id}/skeleton").status_code == 200
-                live.rig.finish(scan_id)
-    assert [event["event"] for event in received] == ["started", "view", "skeleton", "done", "end"]
-    assert [event.get("id") for event in received] == ["1", "2", "3", "4", None]
-    assert received[1]["data"]["views_done"] == 1
-    assert received[1]["data"]["fields"] == {"index": 0}
-    assert received[3]["data"]["state"] == "done"
-
-
-def test_events_resume_after_the_last_one_seen_also_in_another_life(tmp_path):
-    with serving(tmp_path) as live:
-        scan_id = live.start()
-        for index in range(3):
-            live.rig.photograph(scan_id, index)
-        live.rig.finish(scan_id)
-    with serving(tmp_path, FakeRig()) as live:
-        path = f"/v1/scans/{scan_id}/events"
-        with live.http.stream("GET", path, headers={"Last-Event-ID": "2"}) as stream:
-            events = list(read_events(stream))
-        assert [event["event"] for event in events] == ["view", "view", "done", "end"]
-        assert [event["data"]["fields"] for event in events[:2]] == [{"index": 1}, {"index": 2}]
-        answer = live.http.get(path, headers={"Last-Event-ID": "x"})
-        problem(answer, 422, "invalid_request")
-
-
-def test_events_that_no_json_holds_do_not_stop_the_journal(live):
-    scan_id = live.start()
-    live.rig.tell(scan_id, "odd", path=ScanState, number=float("nan"))
-    live.rig.tell("no-such-scan", "view")
-    live.rig.finish(scan_id)
-    with live.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
-        kinds = [event["event"] for event in read_events(stream)]
-    assert kinds == ["started", "odd", "done", "end"]

@@ -17,9 +17,8 @@ from service.http.negotiation import best_media_type, wait_s
 from service.http.skeletons import MEDIA_TYPES
 
 
-@pytest.fixture
-def scan(live):
-    """A live service with a scan that has revisions 1 and 2."""
+def with_two_revisions(live):
+    """Start a scan that has revisions 1 and 2."""
     live.scan_id = live.start()
     live.path = f"/v1/scans/{live.scan_id}/skeleton"
     live.first, live.second = (skeleton(live.scan_id, n, length_m=n) for n in (1, 2))
@@ -27,6 +26,18 @@ def scan(live):
         live.rig.publish(live.scan_id, document)
         wait_until(lambda document=document: live.http.get(live.path).content == document)
     return live
+
+
+@pytest.fixture(scope="module")
+def scan(idle):
+    """A scan with revisions 1 and 2 that nobody changes."""
+    return with_two_revisions(idle)
+
+
+@pytest.fixture
+def growing(live):
+    """A scan with revisions 1 and 2 that goes on."""
+    return with_two_revisions(live)
 
 
 def test_a_skeleton_is_pending_until_there_is_one(live):
@@ -73,23 +84,23 @@ def test_validators_spare_the_transfer(scan):
     assert scan.http.get(scan.path, headers=glb).status_code == 200
 
 
-def test_all_revisions_but_the_newest_are_final(scan):
-    first, second = (scan.http.get(f"{scan.path}/revisions/{n}") for n in (1, 2))
+def test_all_revisions_but_the_newest_are_final(growing):
+    first, second = (growing.http.get(f"{growing.path}/revisions/{n}") for n in (1, 2))
     assert "immutable" in first.headers["cache-control"]
     assert second.headers["cache-control"] == "no-cache"
-    rejected = json.loads(scan.second)
+    rejected = json.loads(growing.second)
     rejected["views"]["rejected"] = [{"index": 2, "reason": "blurred"}]
     corrected = json.dumps(rejected).encode()
-    scan.rig.publish(scan.scan_id, corrected)
-    wait_until(lambda: scan.http.get(scan.path).content == corrected)
-    assert scan.http.get(f"{scan.path}/revisions/2").content == corrected
+    growing.rig.publish(growing.scan_id, corrected)
+    wait_until(lambda: growing.http.get(growing.path).content == corrected)
+    assert growing.http.get(f"{growing.path}/revisions/2").content == corrected
 
 
-def test_a_worker_that_starts_over_does_not_take_the_skeleton_back(scan):
-    scan.rig.publish(scan.scan_id, scan.first)
-    scan.rig.finish(scan.scan_id)
-    wait_until(lambda: scan.http.get(f"/v1/scans/{scan.scan_id}").json()["state"] == "done")
-    assert scan.http.get(scan.path).content == scan.second
+def test_a_worker_that_starts_over_does_not_take_the_skeleton_back(growing):
+    growing.rig.publish(growing.scan_id, growing.first)
+    growing.rig.finish(growing.scan_id)
+    wait_until(lambda: growing.http.get(f"/v1/scans/{growing.scan_id}").json()["state"] == "done")
+    assert growing.http.get(growing.path).content == growing.second
 
 
 def test_what_there_is_not(scan):
@@ -157,16 +168,17 @@ def test_prefer(prefer, seconds):
     assert wait_s(prefer) == seconds
 
 
-@pytest.fixture(params=["whole", "growing"])
-def recorded(request, tmp_path):
+@pytest.fixture(scope="module", params=["whole", "growing"])
+def recorded(request, tmp_path_factory):
     """A service whose rig has the demo's recording, finished or cut as by a scan under way."""
-    path = tmp_path / "scan.mcap"
+    folder = tmp_path_factory.mktemp("recorded")
+    path = folder / "scan.mcap"
     content = DEMO_RECORDING.read_bytes()
     if request.param == "whole":
         path.write_bytes(content)
     else:
         path.with_name("scan.mcap.part").write_bytes(content[: len(content) * 2 // 3])
-    with serving(tmp_path / "state", FakeRig(recording=path)) as live:
+    with serving(folder / "state", FakeRig(recording=path)) as live:
         live.base = f"/v1/scans/{live.start()}"
         yield live
 

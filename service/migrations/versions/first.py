@@ -42,7 +42,7 @@ def upgrade() -> None:
         sa.Column("key", sa.String, primary_key=True),
         sa.Column("body_sha256", sa.String(64), nullable=False),
         sa.Column("scan_id", *_of_scan(), nullable=False),
-        sa.Column("response", sa.JSON),
+        sa.Column("response", sa.JSON, nullable=False),
         sa.Column("created_ns", sa.BigInteger, nullable=False),
     )
 
