@@ -334,7 +334,7 @@ def test_two_views_with_one_index(kit, depth_only, tmp_path):
     "lost", [{SCORES}, {INSTANCES, SCORES}, {DEPTH}, {"/camera/color/calibration"}]
 )
 def test_what_a_view_lost_is_not_taken_from_its_namesake(kit, depth_only, tmp_path, lost):
-    twin = replace(kit.make_view(9), index=1, stereo=None)
+    twin = replace(kit.make_view(9), index=1, stereo=None, intrinsics=replace(kit.lens, fx_px=99.0))
     messages = [
         m
         for v in (*depth_only, twin)
