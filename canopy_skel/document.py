@@ -1,6 +1,7 @@
 """The skeleton document `canopy-skeleton/1`: what planners read."""
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -191,8 +192,19 @@ def _decoded(data: bytes, source: str) -> object:
     def refuse(constant: str) -> None:
         raise DocumentError(f"{source}: {constant} is no JSON number; write finite numbers only")
 
+    def finite(digits: str) -> float:
+        number = float(digits)
+        if math.isinf(number):
+            raise DocumentError(f"{source}: {digits[:40]} is too large; write finite numbers only")
+        return number
+
     try:
-        return json.loads(data, parse_constant=refuse)
+        value: object = json.loads(data, parse_constant=refuse, parse_float=finite)
+        _compact(value).encode()  # What is read can be written again.
+    except UnicodeEncodeError:
+        raise DocumentError(
+            f"{source}: a text in it is no Unicode (half a surrogate pair); write it as UTF-8"
+        ) from None
     except UnicodeDecodeError as error:
         raise DocumentError(
             f"{source}: not UTF-8 at byte {error.start}; is this a skeleton JSON file?"
@@ -202,6 +214,13 @@ def _decoded(data: bytes, source: str) -> object:
             f"{source}: not JSON at line {error.lineno}, column {error.colno} ({error.msg});"
             " is the file cut short, or another format?"
         ) from None
+    except RecursionError:
+        raise DocumentError(f"{source}: nested too deeply; is this a skeleton JSON file?") from None
+    except ValueError:
+        raise DocumentError(
+            f"{source}: holds a whole number of thousands of digits; write indices of vertices"
+        ) from None
+    return value
 
 
 def _read_branch(fields: dict[str, Any]) -> Branch:

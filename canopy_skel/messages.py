@@ -5,12 +5,11 @@ says what is wrong; the caller knows which view and topic it was and says so.
 """
 
 import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
+import reprlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, cast
 
-import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -24,7 +23,7 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as Protobuf
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from canopy_skel.geometry import FloatArray
+from canopy_skel.calibration import Calibration, calibration_from_lists
 from canopy_skel.pixels import Pixels, little_endian, pixels_from_compressed, pixels_from_raw
 
 _P = TypeVar("_P", bound=Protobuf)
@@ -33,6 +32,7 @@ BASE_FRAME = "base"
 TOOL_FRAME = "tool0"
 CAMERA_FRAME = "camera_color_optical_frame"
 JSON_SCHEMA = b'{"type":"object"}'
+_MEND_SCORES = "write the confidence of each branch of the view"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,26 +117,6 @@ class Picture:
     stamp_ns: int
     frame_id: str
     pixels: Pixels
-
-
-@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
-class Calibration:
-    """A camera calibration in the ROS convention.
-
-    k: (3, 3) of the raw image, px. d: distortion coefficients. r: (3, 3) rotates raw into rectified
-    camera axes. p: (3, 4) projection of the rectified image, px; p[0, 3] = -fx * baseline in the
-    right camera of a pair.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    width_px: int
-    height_px: int
-    distortion_model: str
-    d: FloatArray
-    k: FloatArray
-    r: FloatArray
-    p: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -236,43 +216,6 @@ class FoxgloveDecoder:
         return decode_scores(data)
 
 
-def calibration_from_lists(
-    *,
-    stamp_ns: int,
-    frame_id: str,
-    size: tuple[int, int],
-    model: str,
-    d: Iterable[float],
-    k: Sequence[float],
-    r: Sequence[float],
-    p: Sequence[float],
-) -> Calibration:
-    """Build a calibration from row-major lists; R and P may be missing (empty or all zero).
-
-    Raises:
-        ValueError: K is not a pinhole matrix, or a list has a wrong length.
-    """
-    for name, values, lengths in (("K", k, (9,)), ("R", r, (0, 9)), ("P", p, (0, 12))):
-        if len(values) not in lengths or not all(math.isfinite(value) for value in values):
-            raise ValueError(f"{name} must be {lengths[-1]} finite numbers, not {list(values)}")
-    if k[0] <= 0 or k[4] <= 0:
-        raise ValueError("K has no focal length; calibrate the camera")
-    k_matrix = np.array(k, dtype=np.float64).reshape(3, 3)
-    p_matrix = np.zeros((3, 4))
-    p_matrix[:, :3] = k_matrix
-    return Calibration(
-        stamp_ns=stamp_ns,
-        frame_id=frame_id,
-        width_px=size[0],
-        height_px=size[1],
-        distortion_model=model,
-        d=np.array(list(d), dtype=np.float64),
-        k=k_matrix,
-        r=np.array(r, dtype=np.float64).reshape(3, 3) if any(r) else np.eye(3),
-        p=np.array(p, dtype=np.float64).reshape(3, 4) if any(p) else p_matrix,
-    )
-
-
 def decode_scores(data: bytes | str) -> tuple[float, ...]:
     """Return s1, s2, … of {"scores": [s1, s2, …]}.
 
@@ -281,12 +224,16 @@ def decode_scores(data: bytes | str) -> tuple[float, ...]:
     """
     try:
         scores = json.loads(data)["scores"]
-        values = tuple(float(score) for score in scores)
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError('is not a JSON object {"scores": [0.9, …]}') from error
-    if not all(0.0 <= value <= 1.0 for value in values):
-        raise ValueError("holds a score outside [0, 1]")
-    return values
+    except (ValueError, TypeError, KeyError, RecursionError):
+        scores = None
+    if not isinstance(scores, list):
+        raise ValueError(f'is not a JSON object {{"scores": [0.9, …]}}; {_MEND_SCORES}')
+    for number, score in enumerate(scores, start=1):
+        if type(score) not in (int, float) or not 0 <= score <= 1:
+            raise ValueError(
+                f"score {number} is {reprlib.repr(score)}, not a number in 0…1; {_MEND_SCORES}"
+            )
+    return tuple(map(float, scores))
 
 
 def encode_scores(scores: Iterable[float]) -> bytes:
@@ -357,7 +304,10 @@ def _parse(message_class: type[_P], data: bytes) -> _P:
     try:
         return message_class.FromString(data)
     except DecodeError as error:
-        raise ValueError(f"is not a {message_class.DESCRIPTOR.full_name}: {error}") from error
+        raise ValueError(
+            f"is not a {message_class.DESCRIPTOR.full_name} (its {len(data)} bytes do not parse);"
+            " check what writes this topic, and the disk"
+        ) from error
 
 
 def _expect(schema: str, wanted: str) -> None:

@@ -3,6 +3,7 @@
 Every function raises ValueError with a text that says what is wrong with the picture.
 """
 
+from contextlib import suppress
 from typing import Any
 
 import cv2
@@ -78,15 +79,12 @@ def pixels_from_compressed(data: bytes, picture_format: str) -> Pixels:
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     decoded: Pixels | None = None
     if data:
-        try:
+        with suppress(cv2.error):
             decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error as error:
-            raise ValueError(
-                f"the {picture_format} picture cannot be decoded ({error.err})"
-            ) from error
     if decoded is None:
         raise ValueError(
-            f"the {picture_format or 'compressed'} picture ({len(data)} bytes) cannot be decoded"
+            f"the {picture_format or 'compressed'} picture ({len(data)} bytes) cannot be decoded;"
+            " record it whole, as jpeg, png or webp"
         )
     return decoded if decoded.ndim == 2 else cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
 

@@ -197,7 +197,10 @@ class _Exposure:
         if not needed and not all(role in self.parts for role in _PAIR_ROLES):
             return None
         if "left_image" not in self.parts and "right_image" not in self.parts:
-            raise self._error("depth_image", "missing, and there is no stereo pair either")
+            raise self._error(
+                "depth_image",
+                "missing, and there is no stereo pair either; record one of them with every view",
+            )
         left_picture = self._picture("left_image", stamp_ns)
         right_picture = self._picture("right_image", stamp_ns)
         left, right = self._lens("left"), self._lens("right")
@@ -288,7 +291,7 @@ def _check_pair(left: Rectification, right: Rectification) -> None:
         raise ValueError(
             "left and right differ in K or size; give the R and P of the rectification"
         )
-    if not right.baseline_m > 0:
+    if not 0 < right.baseline_m < np.inf:
         raise ValueError("P carries no baseline; P[3] of the right camera is -fx * baseline")
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from canopy_skel.calibration import Calibration
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Intrinsics, StereoPair, UInt8Array, View
 from canopy_skel.geometry import FloatArray, invert
@@ -23,7 +24,6 @@ from canopy_skel.messages import (
     SCORES,
     TOOL_FRAME,
     TRANSFORMS,
-    Calibration,
     Message,
     StampedTransform,
     Topic,

@@ -43,27 +43,23 @@ def refs_by_role(file: McapFile, options: TopicOptions) -> dict[str, list[Messag
 def group_by_sequence(by_role: RefsByRole) -> list[Group]:
     """Group messages that carry the index of their view as `sequence`.
 
-    Of two views with one index the first is kept and the others are returned with a flaw.
+    Several views with one index are told apart by their stamps (`log_time`), so that no view is put
+    together from two. The first in the file is kept and the others are returned with a flaw.
     """
-    copies: dict[tuple[int, int], Group] = {}
+    own: dict[int, dict[str, list[MessageRef]]] = {}
     for role in EXPOSURE_ROLES:
-        seen: dict[int, int] = {}
         for ref in by_role.get(role, ()):
-            copy = seen.get(ref.sequence, 0)
-            seen[ref.sequence] = copy + 1
-            group = copies.setdefault((ref.sequence, copy), Group(index=ref.sequence))
-            group.refs[role] = ref
-    for (index, copy), group in copies.items():
-        if copy:
+            own.setdefault(ref.sequence, {}).setdefault(role, []).append(ref)
+    groups: list[Group] = []
+    for index in sorted(own):
+        first, *others = _with_index(index, own[index], by_role)
+        for group in others:
             group.flaw = (
                 f"view {index}: a second view with this index; the first is used (number the"
                 " messages of each view by `sequence`)"
             )
-        for role in CALIBRATION_ROLES:
-            calibration = _calibration_by_sequence(by_role.get(role, []), group)
-            if calibration is not None:
-                group.refs[role] = calibration
-    return [copies[key] for key in sorted(copies)]
+        groups += [first, *others]
+    return groups
 
 
 def pair_by_stamp(
@@ -113,13 +109,39 @@ def mark_cut_off(groups: list[Group], suspects: list[Group], options: TopicOptio
             )
 
 
-def _calibration_by_sequence(refs: list[MessageRef], group: Group) -> MessageRef | None:
-    """Return the view's own calibration, else the latest from before the view."""
-    stamp_ns = max(ref.log_time_ns for ref in group.refs.values())
-    own = [ref for ref in refs if ref.sequence == group.index]
+def _with_index(index: int, own: RefsByRole, by_role: RefsByRole) -> list[Group]:
+    """Return the views of one index in file order: as many as it has messages in any one role.
+
+    Each other message goes to the view nearest in time, of views at one time to the first without.
+    """
+    fullest = max(own, key=lambda role: len(own[role]))
+    views = [Group(index=index, refs={fullest: ref}) for ref in own[fullest]]
+    at_stamp: dict[int, list[Group]] = {}
+    for group in views:
+        at_stamp.setdefault(group.refs[fullest].log_time_ns, []).append(group)
+
+    def nearest(ref: MessageRef) -> int:
+        return min(at_stamp, key=lambda stamp_ns: abs(stamp_ns - ref.log_time_ns))
+
+    for role in own.keys() - {fullest}:
+        for ref in own[role]:
+            lacking = (group for group in at_stamp[nearest(ref)] if role not in group.refs)
+            group = next(lacking, at_stamp[nearest(ref)][0])
+            group.refs.setdefault(role, ref)
+    for role in CALIBRATION_ROLES:
+        refs = by_role.get(role, [])
+        mine = {nearest(ref): ref for ref in reversed(refs) if ref.sequence == index}
+        for stamp_ns, groups in at_stamp.items():
+            for group in groups:
+                calibration = mine.get(stamp_ns) or _latest_before(refs, group)
+                if calibration is not None:
+                    group.refs[role] = calibration
+    return views
+
+
+def _latest_before(refs: list[MessageRef], group: Group) -> MessageRef | None:
+    stamp_ns = max(ref.log_time_ns for role, ref in group.refs.items() if role in EXPOSURE_ROLES)
     earlier = [ref for ref in refs if ref.log_time_ns <= stamp_ns]
-    if own:
-        return own[0]
     return max(earlier, key=lambda ref: ref.log_time_ns, default=None)
 
 

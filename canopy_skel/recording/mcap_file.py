@@ -120,8 +120,12 @@ def open_recording(path: Path) -> BinaryIO:
         return path.open("rb")
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: no such file; check the path") from error
+    except IsADirectoryError as error:
+        raise RecordingError(f"{path}: is a folder; name the MCAP file in it") from error
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+        raise RecordingError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
+        ) from error
 
 
 class _Walk:
@@ -134,6 +138,9 @@ class _Walk:
     def run(self, stream: BinaryIO) -> None:
         """Read records until the footer, the end of the file, or bytes that are no record."""
         offset = len(MCAP0_MAGIC)
+        if self._file.size < offset:
+            self._file.cut_at = 0
+            return
         while True:
             head = stream.read(_RECORD_HEAD.size)
             opcode, length = _RECORD_HEAD.unpack(head) if len(head) == 9 else (0, 0)

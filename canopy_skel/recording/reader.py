@@ -1,6 +1,7 @@
 """Recordings as views: grouped, posed, undistorted, one at a time."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +25,12 @@ from canopy_skel.recording.mcap_file import (
     MessageRef,
     scan_mcap,
 )
-from canopy_skel.recording.options import ROS2_TOPICS, TopicOptions
+from canopy_skel.recording.options import (
+    CALIBRATION_ROLES,
+    PICTURE_ROLES,
+    ROS2_TOPICS,
+    TopicOptions,
+)
 from canopy_skel.recording.ros2 import Ros2Decoder, header_stamp_ns
 from canopy_skel.recording.transforms import TransformBuffer
 
@@ -32,6 +38,7 @@ METADATA_RECORD = "canopy"
 RECOVERY_RECORD = "canopy_recovery"
 GROUND_TRUTH = "ground_truth_skeleton.json"
 _TOPICS_IN_A_LINE = 20
+_CAMERA_SCHEMAS = ("Image", "RawImage", "CompressedImage", "CameraInfo", "CameraCalibration")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -232,18 +239,36 @@ def _require_cameras(file: McapFile, by_role: RefsByRole, options: TopicOptions)
     pair = "left_image" in by_role and "right_image" in by_role
     side = "color" if "color_image" in by_role else "left"
     cut = f" (it is cut off at byte {file.cut_at})" if file.cut_at is not None else ""
-    if not pair and not {"color_image", "depth_image"} <= set(by_role):
+    cameras = pair or {"color_image", "depth_image"} <= set(by_role)
+    calibrated = f"{side}_calibration" in by_role
+    if not (cameras and calibrated) and _ends_in_first_view(file, by_role, options):
+        raise RecordingError(
+            f"{file.path}: ends before its first whole view (readable up to byte {file.cut_at} of"
+            f" {file.size}); no view can be recovered from it, record it again"
+        )
+    if not cameras:
         raise RecordingError(
             f"{file.path}: no usable camera topic{cut}: needs {options.color_image} with"
             f" {options.depth_image}, or {options.left_image} with {options.right_image};"
             f" it has {_topic_list(file)}; name its topics in the topic options"
         )
-    if f"{side}_calibration" not in by_role:
+    if not calibrated:
         topic = getattr(options, f"{side}_calibration")
         raise RecordingError(
             f"{file.path}: no camera calibration on {topic}{cut}: record it once before the first"
             f" view, or name its topic; it has {_topic_list(file)}"
         )
+
+
+def _ends_in_first_view(file: McapFile, by_role: RefsByRole, options: TopicOptions) -> bool:
+    """Say whether it is for being cut off, not for other names of topics, that no view is whole."""
+    unnamed = any(
+        one.schema.replace("/", ".").rsplit(".")[-1] in _CAMERA_SCHEMAS
+        and options.role_of(one.topic) is None
+        for one in summarise_topics(file)
+    )
+    exposures = max((len(by_role.get(role, ())) for role in PICTURE_ROLES), default=0)
+    return file.cut_at is not None and not unnamed and exposures <= 1
 
 
 def _topic_list(file: McapFile) -> str:
@@ -263,7 +288,7 @@ def _groups(
 ) -> list[Group]:
     main = "color_image" if "color_image" in by_role else "left_image"
     if file.channels[by_role[main][0].channel_id].message_encoding == "cdr":
-        groups, alone = _pair_ros2(file, by_role, options, reader)
+        groups, alone = _pair_ros2(file, by_role, options, reader, warnings)
         if alone:
             warnings.append(
                 f"{file.path.name}: {alone} of {alone + len(groups)} pictures on"
@@ -287,22 +312,27 @@ def _groups(
 
 
 def _pair_ros2(
-    file: McapFile, by_role: RefsByRole, options: TopicOptions, reader: MessageReader
+    file: McapFile,
+    by_role: RefsByRole,
+    options: TopicOptions,
+    reader: MessageReader,
+    warnings: list[str],
 ) -> tuple[list[Group], int]:
-    def stamp_ns(ref: MessageRef) -> int:
-        try:
-            return header_stamp_ns(reader.read(ref)) or ref.log_time_ns
-        except ValueError as error:
-            topic = file.channels[ref.channel_id].topic
-            raise RecordingError(f"{file.path}: {topic}: {error}") from error
-
-    stamps = {
-        ref: stamp_ns(ref)
-        for role, refs in by_role.items()
-        if role.endswith(("_image", "_calibration", "instances"))
-        for ref in refs
-    }
-    return pair_by_stamp(by_role, stamps.__getitem__, options.max_pair_gap_ns)
+    stamps: dict[MessageRef, int] = {}
+    stamped = dict(by_role)
+    for role in (*PICTURE_ROLES, *CALIBRATION_ROLES):
+        refs = by_role.get(role, [])
+        for ref in refs:
+            with suppress(ValueError):
+                stamps[ref] = header_stamp_ns(reader.read(ref)) or ref.log_time_ns
+        stamped[role] = [ref for ref in refs if ref in stamps]
+        if len(stamped[role]) < len(refs):
+            warnings.append(
+                f"{file.path.name}: {len(refs) - len(stamped[role])} of {len(refs)} messages on"
+                f" {getattr(options, role)} are too short for a header and are left out; check what"
+                " writes this topic, and the disk"
+            )
+    return pair_by_stamp(stamped, stamps.__getitem__, options.max_pair_gap_ns)
 
 
 def _last_place(group: Group) -> tuple[int, int]:

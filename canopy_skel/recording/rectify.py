@@ -6,9 +6,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from canopy_skel.calibration import Calibration
 from canopy_skel.frame import Intrinsics
 from canopy_skel.geometry import FloatArray
-from canopy_skel.messages import Calibration
 from canopy_skel.pixels import Pixels
 
 _FISHEYE = ("kannala_brandt", "equidistant")
@@ -67,7 +67,7 @@ def rectification(calibration: Calibration, rectified: bool) -> Rectification:
     turned = not np.allclose(c.r, np.eye(3), atol=1e-9)
     raw_is_pinhole = not c.d.any() and not turned
     matrix = c.k if raw_is_pinhole and not rectified else c.p[:, :3]
-    baseline_m = -c.p[0, 3] / c.p[0, 0]
+    baseline_m = -float(c.p[0, 3]) / float(c.p[0, 0])
     intrinsics = Intrinsics(
         fx_px=float(matrix[0, 0]),
         fy_px=float(matrix[1, 1]),

@@ -8,13 +8,8 @@ from mcap.exceptions import McapError
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from canopy_skel.messages import (
-    Calibration,
-    Picture,
-    StampedTransform,
-    calibration_from_lists,
-    decode_scores,
-)
+from canopy_skel.calibration import Calibration, calibration_from_lists
+from canopy_skel.messages import Picture, StampedTransform, decode_scores
 from canopy_skel.pixels import Pixels, pixels_from_compressed, pixels_from_raw
 
 _PNG = b"\x89PNG"
@@ -87,7 +82,10 @@ class Ros2Decoder:
                 raise ValueError(f"has its schema as {self._schemas[schema].encoding}, not ros2msg")
             return decode(data)
         except (McapError, struct.error, IndexError, UnicodeDecodeError, EOFError) as error:
-            raise ValueError(f"is not a {schema}: {error}") from error
+            raise ValueError(
+                f"is not a {schema} (its {len(data)} bytes do not parse); check what writes this"
+                " topic, and the disk"
+            ) from error
 
 
 def header_stamp_ns(data: bytes) -> int:

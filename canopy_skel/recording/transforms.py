@@ -119,11 +119,14 @@ def _matrix(transform: StampedTransform) -> FloatArray:
     try:
         rotation = rotation_from_quaternion(transform.quaternion_xyzw)
     except ValueError as error:
-        raise ValueError(f"{transform.parent} -> {transform.child}: {error}") from error
+        raise ValueError(
+            f"{transform.parent} -> {transform.child}: {error}; publish a finite quaternion"
+            " (x, y, z, w) of length 1"
+        ) from error
     if not np.isfinite(transform.translation_m).all():
         raise ValueError(
             f"{transform.parent} -> {transform.child}: translation"
-            f" {list(transform.translation_m)} is not finite"
+            f" {list(transform.translation_m)} is not finite; publish it in metres"
         )
     return transform_from(rotation, transform.translation_m)
 

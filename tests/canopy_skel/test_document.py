@@ -190,6 +190,13 @@ BROKEN = {
     "negative radius": (set_at("vertices", "radius", 1, -0.1), r"vertices\.radius\[1\]: -0\.1"),
     "confidence": (set_at("vertices", "confidence", 0, 1.5), r"vertices\.confidence\[0\]: 1\.5"),
     "flat position": (set_at("vertices", "position", 3, [1, 2]), r"vertices\.position\[3\]: "),
+    "far off": (
+        set_at("vertices", "position", 1, 0, 1e308),
+        r"vertices\.position\[1\]\[0\]: 1e\+308",
+    ),
+    "far below": (set_at("vertices", "position", 1, 2, -1.1e6), r"position\[1\]\[2\]: -1100000"),
+    "thick as a hill": (set_at("vertices", "radius", 1, 101), r"vertices\.radius\[1\]: 101"),
+    "half a letter": (set_at("scan_id", "\ud800"), r"a text in it is no Unicode"),
     "overflowing": (set_at("vertices", "radius", 0, float("inf")), r"Infinity is no JSON number"),
     "short array": (set_at("vertices", "radius", [0.1]), r"vertices\.radius has 1 .* has 6"),
     "short extra": (set_at("vertices", "leafy", [1]), r"vertices\.leafy has 1 entries"),
@@ -233,8 +240,12 @@ def test_a_broken_document_is_named_in_one_line(change, message):
         (b"glTF\x02\xff\xfe", "not UTF-8 at byte 5"),
         (b"[]", 'not of type "object"'),
         (b'{"revision": NaN}', "NaN is no JSON number"),
+        (b'{"revision": 1e400}', "1e400 is too large; write finite"),
+        (b"[" * 200_000, "nested too deeply"),
+        (b"9" * 5000, "holds a whole number of thousands of digits"),
     ],
 )
 def test_what_is_no_document_is_named_in_one_line(data, message):
-    with pytest.raises(DocumentError, match=rf"^tree\.json: .*{message}"):
+    with pytest.raises(DocumentError, match=rf"^tree\.json: .*{message}") as caught:
         from_json(data, source="tree.json")
+    assert "\n" not in str(caught.value)

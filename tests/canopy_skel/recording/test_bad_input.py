@@ -79,7 +79,7 @@ def test_no_such_file(tmp_path):
 
 
 def test_a_folder_is_no_recording(tmp_path):
-    with pytest.raises(RecordingError, match=r"cannot be read \(Is a directory\)"):
+    with pytest.raises(RecordingError, match=r"is a folder; name the MCAP file in it$"):
         read_recording(tmp_path)
 
 
@@ -147,7 +147,31 @@ def test_a_calibration_after_a_view_does_not_count(kit, depth_only, tmp_path):
 def test_uncalibrated_camera(read_broken):
     calibration = CameraCalibration(width=64, height=48, K=[0.0] * 9, R=[0.0] * 9, P=[0.0] * 12)
     reason = read_broken(**{"/camera/color/calibration": calibration.SerializeToString()})
-    assert "/camera/color/calibration: K has no focal length; calibrate" in reason
+    assert "/camera/color/calibration: K has no focal length (fx = 0, fy = 0); calibrate" in reason
+
+
+EYE = (1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"D": [0.0, float("nan")]}, "D must be finite numbers, not [0, nan];"),
+        ({"P": [0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0]}, "P has no focal length (fx = 0, fy = 0)"),
+        ({"R": [2.0, *EYE[1:]]}, "R is no rotation: [2, 0, 0, 0, 1, 0, 0, 0, 1];"),
+        ({"R": [*EYE[:8], 0.0]}, "R is no rotation"),
+        ({"R": [*EYE[:8], -1.0]}, "R is no rotation"),
+        ({"R": [1e300] * 9}, "R is no rotation"),
+        ({"R": EYE[:8]}, "R must be 9 finite numbers"),
+    ],
+)
+def test_a_calibration_that_cannot_be(read_broken, changes, text):
+    k = [60.0, 0, 31.5, 0, 61.0, 23.5, 0, 0, 1]
+    whole = {"width": 64, "height": 48, "distortion_model": "plumb_bob", "K": k}
+    data = CameraCalibration(**{**whole, **changes}).SerializeToString()
+    reason = read_broken(**{"/camera/color/calibration": data})
+    assert f"/camera/color/calibration: {text}" in reason
+    assert reason.endswith("; calibrate the camera, or record what its driver publishes")
 
 
 def test_missing_pose(read_broken):
@@ -188,9 +212,15 @@ def test_another_base_frame_is_an_option(kit, depth_only, tmp_path):
 @pytest.mark.parametrize(
     ("pose", "text"),
     [
-        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "base -> tool0: quaternion .* has no direction"),
+        (
+            {"quaternion": (0.0, 0.0, 0.0, 0.0)},
+            "base -> tool0: quaternion .* has no direction; publish a finite",
+        ),
         ({"quaternion": (0.0, float("nan"), 0.0, 1.0)}, "quaternion .*nan.* has no direction"),
-        ({"translation": (0.0, float("inf"), 0.0)}, r"translation \[0.0, inf, 0.0\] is not finite"),
+        (
+            {"translation": (0.0, float("inf"), 0.0)},
+            r"translation \[0.0, inf, 0.0\] is not finite; publish it in",
+        ),
     ],
 )
 def test_degenerate_pose(kit, read_broken, pose, text):
@@ -235,7 +265,9 @@ def test_depth_of_another_moment(kit, read_broken):
 
 
 def test_missing_depth(read_broken):
-    assert f"{DEPTH}: missing, and there is no stereo pair" in read_broken(**{DEPTH: None})
+    assert f"{DEPTH}: missing, and there is no stereo pair either; record" in read_broken(
+        **{DEPTH: None}
+    )
 
 
 def test_missing_colour(read_broken):
@@ -245,11 +277,14 @@ def test_missing_colour(read_broken):
 def test_damaged_colour_picture(kit, read_broken):
     stamp_ns = kit.views[BROKEN].stamp_ns
     data = encode_compressed_image(b"\xff\xd8 torn", "jpeg", stamp_ns, "c")
-    assert f"{COLOR}: the jpeg picture (7 bytes) cannot be decoded" in read_broken(**{COLOR: data})
+    assert f"{COLOR}: the jpeg picture (7 bytes) cannot be decoded; record it" in read_broken(
+        **{COLOR: data}
+    )
 
 
 def test_bytes_that_are_no_message(read_broken):
-    assert f"{DEPTH}: is not a foxglove.RawImage" in read_broken(**{DEPTH: b"\x0a\xff\xff\xff"})
+    reason = read_broken(**{DEPTH: b"\x0a\xff\xff\xff"})
+    assert f"{DEPTH}: is not a foxglove.RawImage (its 4 bytes do not parse); check" in reason
 
 
 def test_instances_without_scores(read_broken):
@@ -272,8 +307,12 @@ def test_an_instance_without_a_score(read_broken):
         (b'{"points": [1]}', "is not a JSON object"),
         (b"[1, 2, 3]", "is not a JSON object"),
         (b"\xff{", "is not a JSON object"),
-        (b'{"scores": [0.5, 0.5, NaN]}', "holds a score outside [0, 1]"),
-        (b'{"scores": [0.5, 0.5, 1.5]}', "holds a score outside [0, 1]"),
+        (b'{"scores": "111"}', "is not a JSON object"),
+        (b"[" * 100_000, "is not a JSON object"),
+        (b'{"scores": [0.5, 0.5, NaN]}', "score 3 is nan, not a number in 0…1; write"),
+        (b'{"scores": [0.5, 1.5, 0.5]}', "score 2 is 1.5, not a number in 0…1; write"),
+        (b'{"scores": [' + b"9" * 400 + b"]}", "score 1 is 9999"),
+        (b'{"scores": ["0.5"]}', "score 1 is '0.5', not a number"),
     ],
 )
 def test_scores_that_are_none(read_broken, data, text):
@@ -289,6 +328,44 @@ def test_two_views_with_one_index(kit, depth_only, tmp_path):
     kit.assert_same_view(found[1], depth_only[1])
     assert isinstance(found[2], RejectedView)
     assert "view 1: a second view with this index; the first is used" in found[2].reason
+
+
+@pytest.mark.parametrize(
+    "lost", [{SCORES}, {INSTANCES, SCORES}, {DEPTH}, {"/camera/color/calibration"}]
+)
+def test_what_a_view_lost_is_not_taken_from_its_namesake(kit, depth_only, tmp_path, lost):
+    twin = replace(kit.make_view(9), index=1, stereo=None, intrinsics=replace(kit.lens, fx_px=99.0))
+    messages = [
+        m
+        for v in (*depth_only, twin)
+        for m in kit.messages_of(v).values()
+        if not (v is depth_only[BROKEN] and m.topic in lost)
+    ]
+    alone = [m for m in messages if m.sequence == BROKEN and m.stamp_ns != twin.stamp_ns]
+    others = [m for m in messages if m.sequence != BROKEN]
+    expected = list(read_recording(kit.write_raw(tmp_path / "b.mcap", [*others, *alone])).views())
+    found = list(read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views())
+
+    assert [one.index for one in found] == [0, 1, 1, 2, 3]
+    assert "view 1: a second view with this index" in found.pop(2).reason
+    for one, wanted in zip(found, expected, strict=True):
+        if isinstance(wanted, View):
+            kit.assert_same_view(one, wanted)
+        else:
+            assert one.reason == wanted.reason
+
+
+def test_messages_of_a_view_recorded_a_little_apart_stay_together(kit, depth_only, tmp_path):
+    twin = replace(kit.make_view(9), index=1, stereo=None)
+    messages = [
+        replace(m, stamp_ns=m.stamp_ns + 1_000_000 * place) if m.topic != TF else m
+        for v in (*depth_only, twin)
+        for place, m in enumerate(kit.messages_of(v).values())
+    ]
+    found = list(read_recording(kit.write_raw(tmp_path / "a.mcap", messages)).views())
+    assert "view 1: a second view" in found.pop(2).reason
+    for view, written in zip(found, depth_only, strict=True):
+        kit.assert_same_view(view, written)
 
 
 def test_a_pair_of_another_camera_needs_a_depth_image(kit, tmp_path):

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from canopy_skel.document import RejectedView
 from canopy_skel.errors import CanopyError, RecordingError
 from canopy_skel.frame import View
-from canopy_skel.recording import read_recording, recover
+from canopy_skel.recording import TopicOptions, read_recording, recover
 
 many = settings(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -48,7 +48,8 @@ def test_a_cut_file_gives_every_view_that_was_whole(kit, whole, tmp_path, data):
     path.write_bytes(content[:length])
 
     if saved == 0:
-        with pytest.raises(RecordingError, match=r"cut\.mcap: "):
+        text = f"ends before its first whole view .* of {length}\\); no view can be recovered"
+        with pytest.raises(RecordingError, match=rf"cut\.mcap: {text if length else 'is empty'}"):
             read_recording(path)
         return
     recording = read_recording(path)
@@ -94,6 +95,14 @@ def test_a_flipped_byte_never_changes_a_view_unnoticed(kit, whole, tmp_path, dat
     for view in usable:
         kit.assert_same_view(view, kit.views[view.index])
     assert len(usable) == len(kit.views) or recording.warnings
+
+
+def test_a_cut_file_whose_cameras_have_other_names_lists_them(whole, tmp_path):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[0][: whole[1][1]])
+    zed = TopicOptions(color_image="/zed/rgb", left_image="/zed/left")
+    with pytest.raises(RecordingError, match=r"topic \(it is cut off .* it has .*/camera/color/im"):
+        read_recording(path, zed)
 
 
 def test_a_damaged_chunk_costs_its_view_only(kit, whole, tmp_path):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from canopy_skel.calibration import Calibration
 from canopy_skel.document import RejectedView
 from canopy_skel.geometry import invert, transform_from, transform_points
 from canopy_skel.messages import (
-    Calibration,
     encode_calibration,
     encode_compressed_image,
     encode_raw_image,

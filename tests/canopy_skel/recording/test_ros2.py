@@ -7,6 +7,8 @@ from types import SimpleNamespace as Message
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer
 from scipy.spatial.transform import Rotation
 
@@ -291,6 +293,55 @@ def test_pictures_that_cannot_be_understood(tmp_path, changes, text):
     good, bad = read_recording(bag.write(tmp_path / "a.mcap")).views()
     assert isinstance(good, View)
     assert bad.reason.startswith(f"view 1: {ROS2_TOPICS.color_image}: {text}")
+
+
+@pytest.mark.parametrize(
+    ("role", "indices_lost"),
+    [("color_image", [1]), ("depth_image", [1]), ("color_calibration", [])],
+)
+def test_a_message_too_short_for_a_header_costs_its_view_at_most(tmp_path, role, indices_lost):
+    bag = driven_bag()
+    for i, ms in enumerate((20, 60, 100)):
+        color, millimetres = pictures(i)
+        bag.image(ROS2_TOPICS.color_image, ms, color, "rgb8")
+        bag.info(ROS2_TOPICS.color_calibration, ms)
+        bag.image(ROS2_TOPICS.depth_image, ms, millimetres, "16UC1")
+    topic = getattr(ROS2_TOPICS, role)
+    recording = read_recording(shortened(bag.write(tmp_path / "a.mcap"), topic, 1))
+    views = list(recording.views())
+
+    kept = [i for i in range(3) if i not in indices_lost]
+    for view, i in zip(views, kept, strict=True):
+        np.testing.assert_array_equal(view.color_rgb, pictures(i)[0])
+        np.testing.assert_array_equal(view.depth_m, pictures(i)[1] / np.float32(1000))
+    text = f"short.mcap: 1 of 3 messages on {topic} are too short for a header and are left out"
+    assert text in recording.warnings[0]
+
+
+def shortened(path, topic, place):
+    """Copy a bag with one message of a topic cut to 3 bytes."""
+    target = path.with_name("short.mcap")
+    with path.open("rb") as source, target.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros2")
+        channels = {}
+        seen = 0
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                own = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, own
+                )
+            seen += channel.topic == topic
+            short = channel.topic == topic and seen == place + 1
+            writer.add_message(
+                channels[channel.id],
+                message.log_time,
+                message.data[:3] if short else message.data,
+                message.publish_time,
+            )
+        writer.finish()
+    return target
 
 
 def test_ros_recordings_are_cut_and_recovered_too(tmp_path):
