@@ -36,6 +36,8 @@ LIMITS = Limits(
     box_max_m=(0.9, 0.9, 1.1),
     keep_outs=(KeepOut(name="tree row", normal=(-1.0, 0.0, 0.0), offset_m=-0.75),),
 )
+WATCHDOG_HZ = 2.0
+"""The controller stops by itself when the driver is silent for half a second."""
 PATHS: Mapping[str, list[FloatArray]] = {
     f"orchard-{views}": [pose @ invert(TOOL_FROM_CAMERA) for pose in camera_path(views)]
     for views in (10, 70)
@@ -139,7 +141,7 @@ def composed(
 
 def guarded(host: str) -> Arm:
     """Return the arm behind a controller, within the limits of the rig."""
-    return GuardedArm(Ur5Arm(Ur5Config(host=host)), LIMITS)
+    return GuardedArm(Ur5Arm(Ur5Config(host=host, watchdog_hz=WATCHDOG_HZ)), LIMITS)
 
 
 @contextmanager

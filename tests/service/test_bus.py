@@ -33,7 +33,7 @@ def envelopes(draw):
     )
     config = MethodConfig(
         name=draw(st.sampled_from(METHODS)),
-        likelihood=LikelihoodConfig(voxel_size_m=draw(st.floats(1e-3, 1.0))),
+        likelihood=LikelihoodConfig(voxel_size_m=draw(st.floats(1e-3, 0.1))),
         straighten_steps=draw(st.integers(0, 50)),
     )
     return ViewEnvelope(
