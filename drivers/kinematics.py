@@ -72,17 +72,29 @@ def inverse(
 ) -> FloatArray | None:
     """Return the joints (6,) that reach a pose with the least turning from `near_joints_rad`.
 
+    None: no solution within reach; see `inverses`.
+    """
+    return next(iter(inverses(base_from_tool0, near_joints_rad)), None)
+
+
+def inverses(
+    base_from_tool0: FloatArray, near_joints_rad: Sequence[float] | FloatArray
+) -> list[FloatArray]:
+    """Return all joints (6,) that reach a pose, those with the least turning first.
+
     Whole turns are chosen per joint within ±360°. Where the wrist is straight (joints 4 and 6
-    parallel) joint 6 stays as it is. None: no solution within reach.
+    parallel) joint 6 stays as it is.
     """
     near = [float(joint) for joint in near_joints_rad]
-    best, least_rad = None, math.inf
-    for solution in _solutions(base_from_tool0.tolist(), near[5]):
-        joints = [_wound(joint, beside) for joint, beside in zip(solution, near, strict=True)]
-        turn_rad = max(abs(joint - beside) for joint, beside in zip(joints, near, strict=True))
-        if turn_rad < least_rad:
-            best, least_rad = joints, turn_rad
-    return None if best is None else np.array(best)
+    found = [
+        [_wound(joint, beside) for joint, beside in zip(solution, near, strict=True)]
+        for solution in _solutions(base_from_tool0.tolist(), near[5])
+    ]
+
+    def turning_rad(joints: list[float]) -> float:
+        return max(abs(joint - beside) for joint, beside in zip(joints, near, strict=True))
+
+    return [np.array(joints) for joints in sorted(found, key=turning_rad)]
 
 
 def _wound(joint_rad: float, near_rad: float) -> float:

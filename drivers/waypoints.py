@@ -1,6 +1,7 @@
 """From where the arm is to the next waypoint: a move that is allowed all the way, or the reason."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -11,6 +12,36 @@ from drivers.guarded_arm import Limits, check
 from drivers.protocols import ArmMode, ArmState, JointMove, LinearMove, Move, ToolPose
 
 JOINT_SPEEDS_RPS = (0.8, 0.4, 0.2, 0.1)
+
+
+READY_JOINTS_RAD = np.array([np.pi, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0])
+"""Upright, elbow bent, facing the tree: from here every part of the workspace is near."""
+
+
+def moves_to(
+    state: ArmState,
+    base_from_tool0: FloatArray,
+    limits: Limits,
+    *,
+    speed_mps: float,
+    acceleration_mps2: float,
+) -> tuple[Move, ...]:
+    """Return the moves from `state` to a pose: one if possible, else two by way of readiness.
+
+    Raises:
+        MoveRefusedError: there is no allowed way; the reason is that of the direct one.
+    """
+    speeds = {"speed_mps": speed_mps, "acceleration_mps2": acceleration_mps2}
+    try:
+        return (move_to(state, base_from_tool0, limits, **speeds),)
+    except MoveRefusedError as refusal:
+        ready = _turn(state, [READY_JOINTS_RAD], limits)
+        if ready is None:
+            raise
+        try:
+            return ready, move_to(after(state, ready), base_from_tool0, limits, **speeds)
+        except MoveRefusedError:
+            raise refusal from None
 
 
 def move_to(
@@ -40,10 +71,18 @@ def move_to(
 def _turn_to(
     state: ArmState, base_from_tool0: FloatArray, limits: Limits, refusal: MoveRefusedError
 ) -> Move:
-    joints = kinematics.inverse(base_from_tool0, state.joints_rad)
-    if joints is None:
+    solutions = kinematics.inverses(base_from_tool0, state.joints_rad)
+    if not solutions:
         raise UnreachableError(str(refusal))
-    for speed_rps in JOINT_SPEEDS_RPS:
+    move = _turn(state, solutions, limits)
+    if move is None:
+        raise refusal
+    return move
+
+
+def _turn(state: ArmState, postures: list[FloatArray], limits: Limits) -> JointMove | None:
+    """Return an allowed move to one of the postures: near ones first, slower ones last."""
+    for speed_rps, joints in product(JOINT_SPEEDS_RPS, postures):
         move = JointMove(
             joints_rad=joints, speed_rps=speed_rps, acceleration_rps2=min(1.0, 2 * speed_rps)
         )
@@ -52,7 +91,7 @@ def _turn_to(
         except MoveRefusedError:
             continue
         return move
-    raise refusal
+    return None
 
 
 def after(state: ArmState, move: Move) -> ArmState:

@@ -13,7 +13,7 @@ from canopy_skel.geometry import FloatArray
 from drivers.errors import ArmError, ArmStoppedError, CameraError, DriverError, MoveRefusedError
 from drivers.guarded_arm import Limits
 from drivers.protocols import Arm, ArmMode, Camera, raise_unless_movable
-from drivers.waypoints import after, move_to
+from drivers.waypoints import after, moves_to
 from service.rig import (
     FINISHED,
     PartStatus,
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 ENOUGH_DISK_BYTES = 1 << 30
 STOP_TIMEOUT_S = 10.0
-SKELETON_TIMEOUT_S = 60.0
+SKELETON_TIMEOUT_S = 10.0
 
 
 class Feed(Protocol):
@@ -109,7 +109,7 @@ class LocalRig:
         verdicts = []
         for index, waypoint in enumerate(spec.waypoints):
             try:
-                move = move_to(
+                moves = moves_to(
                     state,
                     waypoint,
                     self._parts.limits,
@@ -120,7 +120,8 @@ class LocalRig:
                 verdicts.append(WaypointVerdict(index=index, reachable=False, reason=str(error)))
                 continue
             verdicts.append(WaypointVerdict(index=index, reachable=True))
-            state = after(state, move)
+            for move in moves:
+                state = after(state, move)
         return verdicts
 
     def start(self, spec: ScanSpec) -> ScanStatus:
@@ -239,9 +240,8 @@ class LocalRig:
         )
 
     def _await_skeleton(self, state: ScanState) -> None:
-        """Let the last views become a skeleton before the scan is done, if anybody works on it."""
-        feed = self._parts.feed
-        if state is ScanState.DONE and feed.worker().ready and not feed.flush(SKELETON_TIMEOUT_S):
+        """Let the last views become a skeleton before the scan is said to be done."""
+        if state is ScanState.DONE and not self._parts.feed.flush(SKELETON_TIMEOUT_S):
             log.warning("the skeleton of the last views is not there yet")
 
     def _interrupt(self, session: ScanSession, wanted: ScanState) -> None:

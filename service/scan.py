@@ -29,7 +29,7 @@ from drivers.protocols import (
     wait_settled,
 )
 from drivers.quality import QualityLimits, flaws, moved
-from drivers.waypoints import move_to
+from drivers.waypoints import moves_to
 from service.rig import ScanSpec, ScanState, ScanStatus
 
 log = logging.getLogger(__name__)
@@ -188,17 +188,19 @@ class ScanSession:
         arm, spec = self._tools.arm, self._spec
         state = arm.state()
         raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
-        move = move_to(
+        moves = moves_to(
             state,
             waypoint,
             self._tools.limits,
             speed_mps=spec.speed_mps,
             acceleration_mps2=spec.acceleration_mps2,
         )
-        with self._lock:
-            self._check_wanted()
-            arm.start_move(move)
-        return wait_settled(arm, timeout_s=spec.settle_timeout_s)
+        for move in moves:
+            with self._lock:
+                self._check_wanted()
+                arm.start_move(move)
+            state = wait_settled(arm, timeout_s=spec.settle_timeout_s)
+        return state
 
     def _capture(self, index: int, before: ArmState, writer: RecordingWriter) -> View:
         reasons: list[str] = []
