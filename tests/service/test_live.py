@@ -3,6 +3,7 @@
 Each fault says what the operator sees over HTTP; nothing captured is lost and nothing moves.
 """
 
+import json
 import os
 import resource
 import signal
@@ -328,3 +329,17 @@ def test_a_killed_service_leaves_a_scan_that_can_be_resumed(tmp_path):
 
 def _parent(pid):
     return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
+
+
+def test_a_scan_from_the_shell_brings_recording_and_skeleton(rig, tmp_path):
+    command = [Path(sys.executable).with_name("canopy"), "scan", "--json", "--tree", "t3"]
+    command += ["--url", str(rig.http.base_url), "-o", tmp_path]
+    result = subprocess.run(
+        [*map(str, command)], capture_output=True, text=True, check=False, timeout=200
+    )
+    assert result.returncode == 0, result.stderr
+    scanned = json.loads(result.stdout)
+    assert scanned["state"] == "done"
+    recording, skeleton = (Path(file) for file in scanned["files"])
+    assert len(list(read_recording(recording).views())) == 10
+    assert skeleton.read_bytes() == rig.replayed(scanned["scan_id"], tmp_path / "again")
