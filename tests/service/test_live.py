@@ -72,6 +72,7 @@ class Rig:
             memory_limit_bytes=1 << 30,
         )
         recording = self.data / "scans" / scan_id / f"{scan_id}.mcap"
+        out.mkdir(exist_ok=True)
         replay(recording, out, request, lambda done, total: None)
         return (out / f"{scan_id}.skeleton.json").read_bytes()
 
@@ -255,25 +256,6 @@ def test_a_killed_worker_comes_back_and_ends_with_the_same_bytes(rig, view, tmp_
         time.sleep(0.5)
 
 
-def test_a_full_disk_stops_the_scan_and_costs_nothing(rig):
-    scan_id = rig.start()
-    done = rig.wait(scan_id, "running", views=1)["views_done"]
-    part = rig.data / "scans" / scan_id / f"{scan_id}.mcap.part"
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # Like a full disk for this process: files cannot grow beyond what the recording has now.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (part.stat().st_size + 20_000, limits[1]))
-    try:
-        status = rig.wait(scan_id, "stopped", "done")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert status["state"] == "stopped"
-    assert "too large" in status["detail"] or "space" in status["detail"]
-    assert rig.views(scan_id)[:done] == list(range(done))
-    rig.resume(scan_id)
-    rig.wait(scan_id, "done", views=10)
-    assert rig.views(scan_id) == list(range(10))
-
-
 def test_a_second_scan_is_refused_and_stop_is_heard_at_once(rig):
     scan_id = rig.start()
     rig.wait(scan_id, "running", views=1)
@@ -288,43 +270,76 @@ def test_a_second_scan_is_refused_and_stop_is_heard_at_once(rig):
     rig.assert_stands_still()
 
 
-@pytest.mark.timeout(200)
-def test_a_killed_service_leaves_a_scan_that_can_be_resumed(tmp_path):
-    command = [Path(sys.executable).with_name("canopy"), "serve", "--sim", "--data", tmp_path]
-    command += ["--time-scale", "20", "--picture-scale", "0.2", "--leaves", "200"]
+class Service:
+    """`canopy serve --sim` in a process of its own; what it left running is ended with it."""
 
-    def launch():
+    def __init__(self, data):
+        self._command = [Path(sys.executable).with_name("canopy"), "serve", "--sim", "--data", data]
+        self._command += ["--time-scale", "20", "--picture-scale", "0.2", "--leaves", "200"]
+        self._data = data
+
+    def launch(self):
         port = free_port()
-        process = subprocess.Popen(
-            [*map(str, command), "--port", str(port)], stderr=subprocess.DEVNULL
-        )
-        http = httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0)
-        wait_until_ready(http)
-        return process, Rig(http, None, None, tmp_path)
+        command = [*map(str, self._command), "--port", str(port)]
+        self.process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        self.http = httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0)
+        wait_until_ready(self.http)
+        return Rig(self.http, None, None, self._data)
 
-    process, rig = launch()
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+        self.http.close()
+
+    def end(self):
+        self.http.close()
+        self.process.terminate()
+        code = self.process.wait(10)
+        for orphan in processes("mock_hw.fake_ur"):
+            if _parent(orphan) == 1:
+                os.kill(orphan, signal.SIGKILL)
+        return code
+
+
+@pytest.fixture
+def service(tmp_path):
+    running = Service(tmp_path)
+    yield running
+    assert running.end() == 0
+
+
+@pytest.mark.timeout(200)
+def test_a_killed_service_leaves_a_scan_that_can_be_resumed(service):
+    rig = service.launch()
     scan_id = rig.start()
     rig.wait(scan_id, "running", views=2)
-    process.kill()
-    process.wait()
-    rig.http.close()
-    saved = rig.views(scan_id)
-    assert len(saved) >= 2
-    process, rig = launch()
-    try:
-        status = rig.status(scan_id)
-        assert status["state"] == "stopped"
-        assert status["detail"]
-        assert rig.http.post(f"/v1/scans/{scan_id}:resume").status_code == 200
-        rig.wait(scan_id, "done", views=10)
-        assert rig.views(scan_id) == list(range(10))
-    finally:
-        rig.http.close()
-        process.terminate()
-        assert process.wait(10) == 0
-        for orphan in processes("mock_hw.fake_ur"):
-            if os.stat(f"/proc/{orphan}").st_uid == os.getuid() and _parent(orphan) == 1:
-                os.kill(orphan, signal.SIGKILL)
+    service.kill()
+    assert len(rig.views(scan_id)) >= 2
+    rig = service.launch()
+    status = rig.status(scan_id)
+    assert status["state"] == "stopped"
+    assert status["detail"]
+    rig.resume(scan_id)
+    rig.wait(scan_id, "done", views=10)
+    assert rig.views(scan_id) == list(range(10))
+
+
+@pytest.mark.timeout(200)
+def test_a_full_disk_stops_the_scan_and_costs_nothing(service):
+    rig = service.launch()
+    scan_id = rig.start()
+    done = rig.wait(scan_id, "running", views=1)["views_done"]
+    part = rig.data / "scans" / scan_id / f"{scan_id}.mcap.part"
+    # Like a full disk for that process: no file can grow beyond what the recording has now.
+    limit = (part.stat().st_size + 20_000, resource.RLIM_INFINITY)
+    before = resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, limit)
+    status = rig.wait(scan_id, "stopped")
+    resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, before)
+    assert "too large" in status["detail"] or "space" in status["detail"]
+    assert rig.views(scan_id)[:done] == list(range(done))
+    rig.resume(scan_id)
+    rig.wait(scan_id, "done", views=10)
+    assert rig.views(scan_id) == list(range(10))
 
 
 def _parent(pid):
