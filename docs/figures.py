@@ -223,7 +223,7 @@ def edge_lines(walk: Walk, graph: SkeletonGraph, chosen: BoolArray | None = None
 def draw_initial(walk: Walk) -> plt.Figure:
     """Figure 4: from samples to the initial skeleton."""
     centre, voxel_m = busiest_fork(walk), walk.grid.voxel_size_m
-    samples = sample_segments(walk.segments, voxel_m)
+    samples = sample_segments(walk.segments, 0.5 * voxel_m)
     smoothed = smooth_across(samples, CONFIG.initial)
     vertices, _ = consolidate(smoothed, voxel_m)
     figure, axes = plt.subplots(2, 2, figsize=(10, 9), sharex=True, sharey=True)

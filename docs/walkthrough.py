@@ -201,7 +201,7 @@ def busiest_fork(walk: Walk) -> FloatArray:
     """Return the fork of the initial skeleton around which most segments were seen."""
     degree = np.bincount(walk.initial.edges.ravel(), minlength=len(walk.initial.vertices_in_base))
     forks = walk.initial.vertices_in_base[degree >= 3]
-    samples = sample_segments(walk.segments, walk.grid.voxel_size_m).points_in_base
+    samples = sample_segments(walk.segments, 0.5 * walk.grid.voxel_size_m).points_in_base
     near = [(np.linalg.norm(samples - fork, axis=1) < 0.08).sum() for fork in forks]
     return np.asarray(forks[int(np.argmax(near))])
 
