@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.kernels import smooth
-from canopy_skel.likelihood import LikelihoodGrid, Segments, VoxelIndex, voxels_of
+from canopy_skel.likelihood import LikelihoodMap, Segments
+from canopy_skel.voxels import VoxelIndex, voxels_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,24 +39,24 @@ class Samples:
 
 
 def initial_skeleton(
-    segments: Segments, grid: LikelihoodGrid, index: VoxelIndex, config: InitialConfig
+    segments: Segments, likelihood: LikelihoodMap, config: InitialConfig
 ) -> SkeletonGraph:
     """Sample, smooth, consolidate per voxel and span: the observed skeleton, many components."""
-    samples = sample_segments(segments, 0.5 * grid.voxel_size_m)
+    samples = sample_segments(segments, 0.5 * likelihood.voxel_size_m)
     smoothed = smooth_across(samples, config)
-    vertices, radius_m = consolidate(smoothed, grid.voxel_size_m)
-    place = index.find(voxels_of(vertices, grid.voxel_size_m))
+    vertices, radius_m = consolidate(smoothed, likelihood.voxel_size_m)
+    confidence = likelihood.probability_at(voxels_of(vertices, likelihood.voxel_size_m))
     # Smoothing can carry a point out of the map, where nothing says that there is wood.
-    inside = place >= 0
-    vertices, radius_m, place = vertices[inside], radius_m[inside], place[inside]
-    edges = spanning_forest(vertices, grid.voxel_size_m)
+    inside = confidence > 0
+    vertices, radius_m, confidence = vertices[inside], radius_m[inside], confidence[inside]
+    edges = spanning_forest(vertices, likelihood.voxel_size_m)
     kept, edges = prune_spurs(vertices, edges, config.spur_m)
     return SkeletonGraph(
         vertices_in_base=vertices[kept],
         edges=edges,
         radius_m=radius_m[kept],
         occluded=np.zeros(len(kept), dtype=bool),
-        confidence=grid.probability()[place][kept],
+        confidence=confidence[kept],
     )
 
 

@@ -17,8 +17,8 @@ from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
-from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
-from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
+from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
+from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.segment import Segmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
 
@@ -82,6 +82,7 @@ class Skeletonizer:
         self._config = config
         self._stage = stage
         self._map = LikelihoodMap(config.likelihood, memory_limit_bytes)
+        self._search = PathSearch(self._map)
         self._splines: dict[int, list[BranchSpline]] = {}
         self._cameras: dict[int, FloatArray] = {}
         self._instances = 0
@@ -148,22 +149,22 @@ class Skeletonizer:
         """Return the skeleton of all views so far; it does not depend on their order."""
         splines = [spline for index in self.views for spline in self._splines[index]]
         with self._stage("initial"):
-            grid = self._map.grid()
-            index = VoxelIndex(grid.voxels)
-            initial = initial_skeleton(segments_of(splines), grid, index, self._config.initial)
+            initial = initial_skeleton(segments_of(splines), self._map, self._config.initial)
         joins: list[Join] = []
+        voxel_size_m = self._map.voxel_size_m
         with self._stage("join"):
             if self._config.name == "mst":
-                graph = join_by_spanning_tree(initial, grid.voxel_size_m)
+                graph = join_by_spanning_tree(initial, voxel_size_m)
             elif self._config.name == "ftsem":
-                graph = join_break_points(initial, grid.voxel_size_m, self._config.ftsem)
+                graph = join_break_points(initial, voxel_size_m, self._config.ftsem)
             else:
-                joins = search_paths(initial, grid, index)
-                graph = add_paths(initial, joins, grid, index)
+                self._search.update(initial)
+                joins = self._search.joins()
+                graph = add_paths(initial, joins, self._map)
                 graph = straighten_predicted(graph, self._config.straighten_steps)
         return Extraction(
             graph=graph,
-            voxels=len(grid.voxels),
+            voxels=self._map.occupied(),
             observed_components=initial.components()[0],
             joins=tuple(joins),
         )
