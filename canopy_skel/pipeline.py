@@ -21,6 +21,7 @@ from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.segment import Segmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
+from canopy_skel.strands import StrandMap
 
 MethodName = Literal["paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
@@ -83,6 +84,7 @@ class Skeletonizer:
         self._stage = stage
         self._map = LikelihoodMap(config.likelihood, memory_limit_bytes)
         self._search = PathSearch(self._map)
+        self._strands = StrandMap(config.likelihood.voxel_size_m, config.initial.smoothing)
         self._splines: dict[int, list[BranchSpline]] = {}
         self._cameras: dict[int, FloatArray] = {}
         self._instances = 0
@@ -128,6 +130,7 @@ class Skeletonizer:
             splines = [fit_spline(cluster, self._config.spline) for cluster in clusters]
         with self._stage("likelihood"):
             self._map.add(segments_of(splines))
+            self._strands.add(segments_of(splines))
         self._splines[view.index] = splines
         self._cameras[view.index] = view.base_from_camera[:3, 3]
         self._instances += len(masks)
@@ -147,9 +150,8 @@ class Skeletonizer:
 
     def skeleton(self) -> Extraction:
         """Return the skeleton of all views so far; it does not depend on their order."""
-        splines = [spline for index in self.views for spline in self._splines[index]]
         with self._stage("initial"):
-            initial = initial_skeleton(segments_of(splines), self._map, self._config.initial)
+            initial = initial_skeleton(self._strands.smoothed(), self._map, self._config.initial)
         joins: list[Join] = []
         voxel_size_m = self._map.voxel_size_m
         with self._stage("join"):

@@ -209,7 +209,7 @@ def units_of(
 def measure_row(
     segments: Floats, rows: Int32s, row: int, squared: Floats, confidence: Floats, at: int
 ) -> int:
-    """Write (d_l / l)^2 + (d_r / r)^2 and c of a row's voxels from `at` on; return where it ends."""
+    """Write (d_l / l)^2 + (d_r / r)^2 and c of a row's voxels from `at` on; return the end."""
     i = rows[row, 0]
     ax, ay, az, length = segments[i, 3], segments[i, 4], segments[i, 5], segments[i, 6]
     per_length, per_radius = 1.0 / length, 1.0 / segments[i, 7]
