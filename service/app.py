@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 from fastapi import APIRouter, FastAPI
 from fastapi.responses import HTMLResponse
+from fastapi.staticfiles import StaticFiles
 from numpy.typing import ArrayLike
 
 from service.bell import Bell
@@ -64,6 +65,7 @@ def create_app(
     add_handlers(app)
     for router in (_page, rig_routes.router, scan_routes.router, skeleton_routes.router):
         app.include_router(router)
+    app.mount("/console", StaticFiles(packages=[("service", "console")]))
     return app
 
 
