@@ -38,8 +38,9 @@ def main() -> None:
     recording, live = (_named(Path(file), out) for file in scanned["files"])
     _run("replay", recording, "-o", out / "replayed")
     replayed = out / "replayed" / live.name
-    same = "the same bytes as" if replayed.read_bytes() == live.read_bytes() else "NOT the bytes of"
-    _say(f"The skeleton that grew during the scan has {same} a replay of its recording")
+    if replayed.read_bytes() != live.read_bytes():
+        sys.exit(f"{live} and {replayed} differ: the live skeleton is not that of its recording")
+    _say("The skeleton that grew during the scan has the bytes that a replay of it gives")
     for name in ("skeleton.glb", "overlay.png"):
         (out / "replayed" / f"{DEMO}.{name}").replace(out / f"{DEMO}.{name}")
     scores = json.loads(_run("score", live, recording, "--json"))
@@ -51,8 +52,6 @@ def main() -> None:
     _say(f"The recording: {recording}")
     _say(f"The skeleton:  {live}, and for viewers {out / DEMO}.skeleton.glb")
     _say(f"Its picture:   {out / DEMO}.overlay.png")
-    if replayed.read_bytes() != live.read_bytes():
-        sys.exit(1)
 
 
 def _named(file: Path, out: Path) -> Path:
