@@ -1,8 +1,8 @@
 """Samples of all segments, merged where they agree, and moved onto the curves they lie on.
 
-Samples in one half-voxel that run roughly the same way are one strand: integer sums of their positions,
-directions and radii. So the number of strands is bounded by the tree, not by the views; the order
-of views does not matter to the bit; and a view can be taken off again.
+Samples in one half-voxel that run roughly the same way are one strand: integer sums of their
+positions, directions and radii. So the number of strands is bounded by the tree, not by the views;
+the order of views does not matter to the bit; and a view can be taken off again.
 """
 
 from dataclasses import dataclass
