@@ -44,7 +44,7 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python benchmarks/stages.py
+	$(BIN)/python benchmarks/stages.py --output docs/results
 
 results: $(READY)
 	$(BIN)/python benchmarks/recordings.py ../shared/data/recordings --output docs/results.md

@@ -124,6 +124,12 @@ class LikelihoodMap:
         return self._config.voxel_size_m
 
     @property
+    def nbytes(self) -> int:
+        """Memory held, in bytes."""
+        kept = (self.levels, self._sums, self._marks, self.blocks.top)
+        return sum(array.nbytes for array in kept)
+
+    @property
     def saturated(self) -> bool:
         """Whether some sum has hit its limit: then nothing can be taken off exactly."""
         return bool((self._sums == ellipsoid.MAX_SUM).any())
@@ -143,7 +149,7 @@ class LikelihoodMap:
     def merge(self, grid: LikelihoodGrid) -> None:
         """Add what another map of the same voxel size knows."""
         x, y, z = grid.voxels.T
-        self._cover(np.stack([x, y, z, z + 1], axis=1))
+        self._cover(np.stack([x, x, y, z, z + 1], axis=1))
         slots = self.blocks.slots_of(grid.voxels)
         total = self._sums[slots].astype(np.int64) + grid.units
         self._sums[slots] = np.minimum(total, ellipsoid.MAX_SUM)
@@ -192,7 +198,8 @@ class LikelihoodMap:
         wide = ellipsoid.rows_of_segments(rows, k)
         thin = ellipsoid.rows_on_segments(rows)
         if sign > 0:
-            self._cover(np.concatenate([wide, thin])[:, 1:])
+            self._cover(wide)
+            self._cover(thin)
         for covered, rest in ((wide, False), (thin, True)):
             changed = ellipsoid.accumulate(
                 rows,
@@ -226,7 +233,7 @@ class LikelihoodMap:
         )
 
     def _cover(self, rows: Int32Array) -> None:
-        self.blocks.cover(rows)
+        self.blocks.cover(rows[:, 1:])
         self.levels = grown(self.levels, self.blocks.slots, 0)
         self._sums = grown(self._sums, self.blocks.slots, 0)
         self._marks = grown(self._marks, self.blocks.slots, 0)

@@ -54,6 +54,12 @@ class PathSearch:
         self._costs: IntArray = np.zeros(0, dtype=np.int64)
 
     @property
+    def nbytes(self) -> int:
+        """Memory held, in bytes."""
+        kept = (self._levels, self._distance, self._previous, self._label, self._marks)
+        return sum(array.nbytes for array in kept)
+
+    @property
     def distances(self) -> Int32Array:
         """Cost from the nearest wood per slot of the map, `search.UNREACHED` where none leads."""
         return self._distance[: self._map.blocks.slots]
@@ -104,7 +110,7 @@ class PathSearch:
             self._label,
             self._marks,
         )
-        paths = np.split(slots.astype(np.int64), starts[1:]) if len(starts) else []
+        paths = np.split(slots, starts[1:]) if len(starts) else []
         return [self._join(path, int(cost)) for path, cost in zip(paths, totals, strict=True)]
 
     def preview(self) -> list[Join]:
@@ -129,6 +135,8 @@ class PathSearch:
     def _changed_levels(self) -> tuple[Int32Array, Int32Array]:
         """Take over the map's levels; return the slots where they rose and where they fell."""
         changed = self._map.take_changed()
+        if self._label_count == 0:
+            changed = np.flatnonzero(self._map.levels).astype(np.int32)
         old, new = self._levels[changed], self._map.levels[changed]
         self._levels[changed] = new
         return changed[new > old], changed[new < old]
@@ -213,8 +221,8 @@ class PathSearch:
         return self._edges[order], self._costs[order], ends[order], parent
 
     def _trace(self, edge: int) -> IntArray:
-        path = kernels.trace(edge, self._map.blocks.neighbours, self._previous)
-        return path.astype(np.int64)
+        path: IntArray = kernels.trace(edge, self._map.blocks.neighbours, self._previous)
+        return path
 
     def _join(self, path: IntArray, units: int) -> Join:
         voxels = self._map.blocks.voxels_at(path)
@@ -253,7 +261,7 @@ def add_paths(graph: SkeletonGraph, joins: list[Join], likelihood: LikelihoodMap
         steps = pairwise(vertex_at[voxel] for voxel in path)
         edges.update(dict.fromkeys((min(step), max(step)) for step in steps))
     voxels = np.array(added, dtype=np.int32).reshape(-1, 3)
-    centres: FloatArray = (voxels + 0.5) * voxel_size_m
+    centres = np.asarray((voxels + 0.5) * voxel_size_m, dtype=np.float64)
     return SkeletonGraph(
         vertices_in_base=np.concatenate([graph.vertices_in_base, centres]),
         edges=np.concatenate([graph.edges, np.array(list(edges), dtype=np.int64).reshape(-1, 2)]),

@@ -57,8 +57,8 @@ def fit_splines(clusters: Sequence[BranchCluster], config: SplineConfig) -> list
     )
     cameras = np.array([cluster.camera_in_base for cluster in clusters])
     rays = directions_across(means - cameras, axes[:, 0])
-    sideways, widths = np.cross(rays, axes[:, 0]), np.zeros((len(clusters), 2))
-    fit.half_widths(points, start, controls, axes, means, counts, sideways, widths)
+    widths = np.zeros((len(clusters), 2))
+    fit.half_widths(points, start, controls, axes, counts, rays, widths)
     across_m = widths[:, 1] + [cluster.margin_m for cluster in clusters]
     radius_m = widths[:, 0] if config.radius == "extent" else across_m
     controls += (config.centre_shift * across_m[:, None] * rays)[:, None]
@@ -82,6 +82,7 @@ def directions_across(vectors: FloatArray, axes: FloatArray) -> FloatArray:
     across = vectors - (vectors * axes).sum(axis=1)[:, None] * axes
     norm = np.linalg.norm(across, axis=1)
     along = norm < 1e-6 * np.linalg.norm(vectors, axis=1)
-    least = np.argmin(np.abs(axes[along]), axis=1)
-    across[along] = np.cross(axes[along], np.eye(3)[least])
-    return across / np.linalg.norm(across, axis=1)[:, None]
+    if along.any():
+        least = np.argmin(np.abs(axes[along]), axis=1)
+        across[along] = np.cross(axes[along], np.eye(3)[least])
+    return np.asarray(across / np.linalg.norm(across, axis=1)[:, None])

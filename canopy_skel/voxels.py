@@ -53,13 +53,11 @@ class VoxelBlocks:
         """Allocate the blocks that rows (R, 4) of x, y, first z, end z touch."""
         if len(rows) == 0:
             return
-        low = rows[:, :3].min(axis=0).astype(np.int64) >> 3
-        high = (rows[:, [0, 1, 3]].max(axis=0).astype(np.int64) - [0, 0, 1] >> 3) + 1
-        self._span(low, high)
-        before = self.count
-        self.count = blocks.allocate(self.top, self.origin, np.ascontiguousarray(rows), before)
-        fresh = np.argwhere(self.top >= before)
-        if len(fresh):
+        rows, before = np.ascontiguousarray(rows), self.count
+        self._span(*blocks.bounds(rows))
+        self.count = blocks.allocate(self.top, self.origin, rows, before)
+        if self.count > before:
+            fresh = np.argwhere(self.top >= before)
             self.places = grown(self.places, self.count, 0)
             self.neighbours = grown(self.neighbours, self.count, 0)
             self.places[self.top[tuple(fresh.T)]] = fresh + self.origin
@@ -67,12 +65,13 @@ class VoxelBlocks:
 
     def slots_of(self, voxels: Int32Array) -> IntArray:
         """Return the slots (N,) of (N, 3) voxels; below 512 where nothing is allocated."""
-        return blocks.slots_of(self.top, self.origin, np.ascontiguousarray(voxels))
+        slots: IntArray = blocks.slots_of(self.top, self.origin, np.ascontiguousarray(voxels))
+        return slots
 
     def voxels_at(self, slots: IntArray) -> Int32Array:
         """Return the voxels (N, 3) of (N,) slots."""
         inside = np.stack([slots >> 6 & 7, slots >> 3 & 7, slots & 7], axis=1)
-        return (self.places[slots >> 9] * 8 + inside).astype(np.int32)
+        return np.asarray(self.places[slots >> 9] * 8 + inside, dtype=np.int32)
 
     def _span(self, low: IntArray, high: IntArray) -> None:
         """Grow the top table so that it spans blocks [low, high)."""

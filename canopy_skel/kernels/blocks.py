@@ -24,7 +24,7 @@ def _moves() -> Int32s:
     step = (np.indices((3, 3, 3)) - 1).reshape(3, 1, 27)
     x, y, z = place + step
     block = ((x >> 3) + 1) * 9 + ((y >> 3) + 1) * 3 + (z >> 3) + 1
-    return (block << 9 | (x & 7) << 6 | (y & 7) << 3 | (z & 7)).astype(np.int32).ravel()
+    return np.asarray(block << 9 | (x & 7) << 6 | (y & 7) << 3 | (z & 7), np.int32).ravel()
 
 
 MOVES = _moves()
@@ -36,7 +36,7 @@ def slot_of(top: Int32s, origin: Ints, x: int, y: int, z: int) -> int:
     bx, by, bz = (x >> 3) - origin[0], (y >> 3) - origin[1], (z >> 3) - origin[2]
     if not (0 <= bx < top.shape[0] and 0 <= by < top.shape[1] and 0 <= bz < top.shape[2]):
         return 0
-    return (np.int64(top[bx, by, bz]) << 9) | ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
+    return (int(top[bx, by, bz]) << 9) | ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
 
 
 @njit("int64[::1](int32[:,:,::1], int64[::1], int32[:,::1])", cache=True, nogil=True)
@@ -46,6 +46,22 @@ def slots_of(top: Int32s, origin: Ints, voxels: Int32s) -> Ints:
     for i in range(len(voxels)):
         slots[i] = slot_of(top, origin, voxels[i, 0], voxels[i, 1], voxels[i, 2])
     return slots
+
+
+@njit("int64[:,::1](int32[:,::1])", cache=True, nogil=True)
+def bounds(rows: Int32s) -> Ints:
+    """Return the first and the end block (2, 3) of rows (R, 4) of x, y, first z, end z."""
+    span = np.empty((2, 3), dtype=np.int64)
+    for i in range(3):
+        span[0, i], span[1, i] = rows[0, i], rows[0, i]
+    for r in range(len(rows)):
+        for i in range(3):
+            span[0, i] = min(span[0, i], rows[r, i])
+            span[1, i] = max(span[1, i], rows[r, i])
+        span[1, 2] = max(span[1, 2], rows[r, 3] - 1)
+    for i in range(3):
+        span[0, i], span[1, i] = span[0, i] >> 3, (span[1, i] >> 3) + 1
+    return span
 
 
 @njit("int64(int32[:,:,::1], int64[::1], int32[:,::1], int64)", cache=True, nogil=True)
@@ -78,7 +94,7 @@ def connect(top: Int32s, neighbours: Int32s, fresh: Ints) -> None:
 def beside(neighbours: Int32s, slot: int, k: int) -> int:
     """Return the slot in direction k of a slot."""
     move = MOVES[(slot & 511) * 27 + k]
-    return (np.int64(neighbours[slot >> 9, move >> 9]) << 9) | (move & 511)
+    return int((int(neighbours[slot >> 9, move >> 9]) << 9) | (move & 511))
 
 
 @njit("int64(int32[:,::1], int64)", cache=True, nogil=True)
@@ -92,7 +108,7 @@ def key_of(places: Int32s, slot: int) -> int:
     x = ((places[block, 0] - places[1, 0]) << 3) + ((slot >> 6) & 7) + _BIAS
     y = ((places[block, 1] - places[1, 1]) << 3) + ((slot >> 3) & 7) + _BIAS
     z = ((places[block, 2] - places[1, 2]) << 3) + (slot & 7) + _BIAS
-    return (np.int64(x) << 42) | (np.int64(y) << 21) | np.int64(z)
+    return (int(x) << 42) | (int(y) << 21) | int(z)
 
 
 @njit("int32[:,::1](int32[:,::1], int32[:,:,::1], int64[::1])", cache=True, nogil=True)

@@ -98,7 +98,7 @@ def resized(rows: Int32s, length: int) -> Int32s:
 def rows_of_segments(segments: Floats, reach: float) -> Int32s:
     """Return (R, 5) int32 rows (segment, x, y, first z, end z) that cover all supports."""
     count = 0
-    rows = np.empty((1024, 5), dtype=np.int32)
+    rows = np.empty((1 << 15, 5), dtype=np.int32)
     for i in range(len(segments)):
         x0, x1 = box_of(segments, i, reach, 0)
         box_y0, box_y1 = box_of(segments, i, reach, 1)
@@ -253,7 +253,7 @@ def add_to_rows(
     at = 0
     highest = len(level_table) - 1
     for r in range(first, end):
-        slot = np.int64(0)
+        slot = 0
         for z in range(rows[r, 3], rows[r, 4]):
             if slot == 0 or z & 7 == 0:
                 slot = slot_of(top, origin, rows[r, 1], rows[r, 2], z)

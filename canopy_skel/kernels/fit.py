@@ -48,22 +48,19 @@ def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Fl
     The sign of an axis is canonical: its largest component is positive.
     """
     spread, vectors = np.zeros((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        mean[i] = 0.0
+    mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
     for n in range(first, end):
-        for i in range(3):
-            mean[i] += points[n, i]
-    for i in range(3):
-        mean[i] /= end - first
+        mx, my, mz = mx + points[n, 0], my + points[n, 1], mz + points[n, 2]
+    mx, my, mz = mx / (end - first), my / (end - first), mz / (end - first)
     for n in range(first, end):
-        x, y, z = points[n, 0] - mean[0], points[n, 1] - mean[1], points[n, 2] - mean[2]
-        spread[0, 0] += x * x
-        spread[0, 1] += x * y
-        spread[0, 2] += x * z
-        spread[1, 1] += y * y
-        spread[1, 2] += y * z
-        spread[2, 2] += z * z
-    spread[1, 0], spread[2, 0], spread[2, 1] = spread[0, 1], spread[0, 2], spread[1, 2]
+        x, y, z = points[n, 0] - mx, points[n, 1] - my, points[n, 2] - mz
+        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+    mean[0], mean[1], mean[2] = mx, my, mz
+    spread[0, 0], spread[1, 1], spread[2, 2] = xx, yy, zz
+    spread[0, 1] = spread[1, 0] = xy
+    spread[0, 2] = spread[2, 0] = xz
+    spread[1, 2] = spread[2, 1] = yz
     diagonalise(spread, vectors)
     used = np.zeros(3)
     for row in range(3):
@@ -160,15 +157,16 @@ def fit_splines(
     for c in range(len(start) - 1):
         first, end = start[c], start[c + 1]
         principal_frame(points, first, end, axes[c], means[c])
+        ax, ay, az = axes[c, 0, 0], axes[c, 0, 1], axes[c, 0, 2]
+        shift = means[c, 0] * ax + means[c, 1] * ay + means[c, 2] * az
         low, high = math.inf, -math.inf
         for n in range(first, end):
-            t = 0.0
-            for i in range(3):
-                t += (points[n, i] - means[c, i]) * axes[c, 0, i]
+            t = points[n, 0] * ax + points[n, 1] * ay + points[n, 2] * az - shift
             along[n - first] = t
             low, high = min(low, t), max(high, t)
+        scale = 1.0 / max(high - low, 1e-12)
         for n in range(end - first):
-            along[n] = (along[n] - low) / max(high - low, 1e-12)
+            along[n] = min((along[n] - low) * scale, 1.0)
         count, enough = most, False
         while not enough:
             normal_equations(points, first, end, along, count, matrix, weight, controls[c])
@@ -185,8 +183,8 @@ def fit_splines(
 
 
 @njit(
-    "void(float64[:,::1], int64[::1], float64[:,:,::1], float64[:,:,::1], float64[:,::1],"
-    " int64[::1], float64[:,::1], float64[:,::1])",
+    "void(float64[:,::1], int64[::1], float64[:,:,::1], float64[:,:,::1], int64[::1],"
+    " float64[:,::1], float64[:,::1])",
     cache=True,
     nogil=True,
 )
@@ -195,36 +193,34 @@ def half_widths(
     start: Ints,
     controls: Floats,
     axes: Floats,
-    means: Floats,
     counts: Ints,
-    sideways: Floats,
+    rays: Floats,
     widths: Floats,
 ) -> None:
-    """Write half the extent along PC2, and sqrt(3) deviations from the spline along `sideways`."""
+    """Write half the extent along PC2, and sqrt(3) deviations from the spline across the rays."""
     for c in range(len(start) - 1):
         first, end, count = start[c], start[c + 1], counts[c]
-        low, high = math.inf, -math.inf
-        near, far = math.inf, -math.inf
+        ax, ay, az = axes[c, 0, 0], axes[c, 0, 1], axes[c, 0, 2]
+        bx, by, bz = axes[c, 1, 0], axes[c, 1, 1], axes[c, 1, 2]
+        sx = rays[c, 1] * az - rays[c, 2] * ay
+        sy = rays[c, 2] * ax - rays[c, 0] * az
+        sz = rays[c, 0] * ay - rays[c, 1] * ax
+        near, far, low, high = math.inf, -math.inf, math.inf, -math.inf
         for n in range(first, end):
-            t = u = 0.0
-            for i in range(3):
-                t += (points[n, i] - means[c, i]) * axes[c, 0, i]
-                u += (points[n, i] - means[c, i]) * axes[c, 1, i]
-            near, far = min(near, t), max(far, t)
-            low, high = min(low, u), max(high, u)
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            t, u = x * ax + y * ay + z * az, x * bx + y * by + z * bz
+            near, far, low, high = min(near, t), max(far, t), min(low, u), max(high, u)
+        scale = (count - 1) / max(far - near, 1e-12)
         total = squares = 0.0
         for n in range(first, end):
-            t = 0.0
-            for i in range(3):
-                t += (points[n, i] - means[c, i]) * axes[c, 0, i]
-            place = (t - near) / max(far - near, 1e-12) * (count - 1)
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            place = (x * ax + y * ay + z * az - near) * scale
             k = min(int(place), count - 2)
-            off = 0.0
-            for i in range(3):
-                fitted = controls[c, k, i] + (place - k) * (
-                    controls[c, k + 1, i] - controls[c, k, i]
-                )
-                off += (points[n, i] - fitted) * sideways[c, i]
+            b = place - k
+            a = 1.0 - b
+            off = sx * (x - a * controls[c, k, 0] - b * controls[c, k + 1, 0])
+            off += sy * (y - a * controls[c, k, 1] - b * controls[c, k + 1, 1])
+            off += sz * (z - a * controls[c, k, 2] - b * controls[c, k + 1, 2])
             total += off
             squares += off * off
         mean = total / (end - first)

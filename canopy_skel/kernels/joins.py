@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from canopy_skel.kernels.blocks import CENTRE, SLOTS, beside, key_of
-from canopy_skel.kernels.search import COSTS, LENGTHS, UNREACHED, resized
+from canopy_skel.kernels.search import COSTS, LENGTHS, UNREACHED
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -32,7 +32,7 @@ def root_of(parent: Int32s, label: int) -> int:
     """Return the representative of a component, shortening the way to it."""
     while parent[label] != label:
         parent[label] = parent[parent[label]]
-        label = np.int64(parent[label])
+        label = int(parent[label])
     return label
 
 
@@ -66,8 +66,8 @@ def borders_of(
                 v = beside(neighbours, slot, k)
                 if levels[v] == 0 or label[v] == label[slot] or distance[v] == UNREACHED:
                     continue
-                way = np.int64(distance[slot]) + distance[v]
-                way += COSTS[np.int64(levels[slot]) + levels[v]] + LENGTHS[k]
+                way = int(distance[slot]) + distance[v]
+                way += COSTS[int(levels[slot]) + levels[v]] + LENGTHS[k]
                 low, high = min(label[slot], label[v]), max(label[slot], label[v])
                 pair = 0
                 while pair < pairs and (met[pair, 0] != low or met[pair, 1] != high):
@@ -115,18 +115,18 @@ def span(ends: Ints, parent: Int32s) -> Ints:
     return resized_long(taken, count)
 
 
-@njit("int32[::1](int64, int32[:,::1], uint8[::1])", cache=True, nogil=True)
-def trace(edge: int, neighbours: Int32s, previous: Bytes) -> Int32s:
+@njit("int64[::1](int64, int32[:,::1], uint8[::1])", cache=True, nogil=True)
+def trace(edge: int, neighbours: Int32s, previous: Bytes) -> Ints:
     """Return the slots of the way over a border, from source to source, the lower voxel's first."""
-    path = np.empty(64, dtype=np.int32)
+    path = np.empty(64, dtype=np.int64)
     u = edge >> 5
     v = beside(neighbours, u, edge & 31)
     path[0] = u
     count = 1
     while previous[u] != CENTRE:
-        u = beside(neighbours, u, np.int64(previous[u]))
+        u = beside(neighbours, u, int(previous[u]))
         if count + 1 >= len(path):
-            path = resized(path, 2 * len(path))
+            path = resized_long(path, 2 * len(path))
         path[count] = u
         count += 1
     for i in range(count // 2):
@@ -134,12 +134,12 @@ def trace(edge: int, neighbours: Int32s, previous: Bytes) -> Int32s:
     path[count] = v
     count += 1
     while previous[v] != CENTRE:
-        v = beside(neighbours, v, np.int64(previous[v]))
+        v = beside(neighbours, v, int(previous[v]))
         if count == len(path):
-            path = resized(path, 2 * len(path))
+            path = resized_long(path, 2 * len(path))
         path[count] = v
         count += 1
-    return resized(path, count)
+    return resized_long(path, count)
 
 
 @njit(
@@ -196,7 +196,7 @@ def roll_back(
 
 
 @njit(
-    "Tuple((int32[::1], int64[::1], int64[::1], int64))(int64[::1], int64[::1], int64[:,::1],"
+    "Tuple((int64[::1], int64[::1], int64[::1], int64))(int64[::1], int64[::1], int64[:,::1],"
     " int32[::1], int64, uint8[::1], int32[:,::1], int32[:,::1], int32[::1], uint8[::1],"
     " int32[::1], uint8[::1])",
     cache=True,
@@ -226,10 +226,10 @@ def join_all(
     """
     borders = [(costs[i], ends[i, 0], edges[i] & 31, edges[i] >> 5) for i in range(len(edges))]
     heapq.heapify(borders)
-    pending = [np.int64(0)]
+    pending = [0]
     pending.clear()
     journal, noted, settled = np.empty((1 << 12, 4), dtype=np.int32), 0, 0
-    slots, starts = np.empty(0, dtype=np.int32), np.empty(joins, dtype=np.int64)
+    slots, starts = np.empty(0, dtype=np.int64), np.empty(joins, dtype=np.int64)
     totals, done = np.empty(joins, dtype=np.int64), 0
     while done < joins and (borders or pending):
         if pending and (not borders or 2 * (pending[0] >> 32) <= borders[0][0]):
@@ -244,8 +244,8 @@ def join_all(
                 v = beside(neighbours, u, k)
                 if levels[v] == 0 or k == CENTRE:
                     continue
-                step = np.int64(COSTS[np.int64(levels[u]) + levels[v]] + LENGTHS[k])
-                through, known = distance[u] + step, np.int64(distance[v])
+                step = int(COSTS[int(levels[u]) + levels[v]] + LENGTHS[k])
+                through, known = distance[u] + step, int(distance[v])
                 better = through < known or (through == known and 26 - k < previous[v])
                 relabel = through == known and previous[v] == 26 - k
                 if better or relabel:
@@ -257,7 +257,7 @@ def join_all(
                         marks[v] |= 1
                         heapq.heappush(pending, through << 32 | v)
                 if distance[v] != UNREACHED and (
-                    root_of(parent, np.int64(label[u])) != root_of(parent, np.int64(label[v]))
+                    root_of(parent, int(label[u])) != root_of(parent, int(label[v]))
                 ):
                     total = distance[u] + step + distance[v]
                     lower, way = (u, k) if k > CENTRE else (v, 26 - k)
@@ -265,19 +265,19 @@ def join_all(
             continue
         total, _, k, u = heapq.heappop(borders)
         v = beside(neighbours, u, k)
-        a, b = root_of(parent, np.int64(label[u])), root_of(parent, np.int64(label[v]))
-        step = np.int64(COSTS[np.int64(levels[u]) + levels[v]] + LENGTHS[k])
+        a, b = root_of(parent, int(label[u])), root_of(parent, int(label[v]))
+        step = int(COSTS[int(levels[u]) + levels[v]] + LENGTHS[k])
         if a == b or total != distance[u] + step + distance[v]:
             continue
         path = trace(u << 5 | k, neighbours, previous)
         parent[max(a, b)] = min(a, b)
         starts[done], totals[done] = len(slots), total
         done += 1
-        slots = resized(slots, len(slots) + len(path))
+        slots = resized_long(slots, len(slots) + len(path))
         while noted + len(path) > len(journal):
             journal = longer(journal, 2 * len(journal))
         for i in range(len(path)):
-            w = np.int64(path[i])
+            w = path[i]
             slots[len(slots) - len(path) + i] = w
             if distance[w] > 0:
                 noted = note(w, noted, journal, distance, previous, label, marks)

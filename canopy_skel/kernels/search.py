@@ -37,7 +37,8 @@ def _costs() -> Int32s:
 def _lengths() -> Int32s:
     """Return what the length of a step adds, by direction."""
     steps = np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0).ravel()
-    return np.array([0, 5, 7, 9])[steps].astype(np.int32)
+    lengths: Int32s = np.array([0, 5, 7, 9], dtype=np.int32)[steps]
+    return lengths
 
 
 COSTS = _costs()
@@ -62,14 +63,14 @@ def pull(
     v: int, levels: Bytes, neighbours: Int32s, distance: Int32s, previous: Bytes, label: Int32s
 ) -> bool:
     """Give v the best way through its neighbours if it is better than its own; say if it is."""
-    best, through, found = np.int64(distance[v]), np.int64(previous[v]), np.int64(0)
+    best, through, found = int(distance[v]), int(previous[v]), 0
     if distance[v] == UNREACHED:
         through = 27
     for k in range(27):
         u = beside(neighbours, v, k)
         if k == CENTRE or levels[u] == 0 or distance[u] == UNREACHED:
             continue
-        cost = np.int64(distance[u]) + COSTS[levels[u] + levels[v]] + LENGTHS[k]
+        cost = int(distance[u]) + COSTS[levels[u] + levels[v]] + LENGTHS[k]
         if cost < best or (cost == best and k < through):
             best, through, found = cost, k, u
     if found == 0:
@@ -98,7 +99,7 @@ def invalidate(
             distance[stack[i]] = UNREACHED
     done = 0
     while done < count:
-        u = np.int64(stack[done])
+        u = int(stack[done])
         done += 1
         touched[u >> 9] = 1
         for k in range(27):
@@ -126,7 +127,7 @@ def fill_ring(
 
     state: entries in the pool, entries in the buckets, first bucket, bucket the round ends at.
     """
-    nearest = np.int64(UNREACHED)
+    nearest = int(UNREACHED)
     for i in range(len(waiting)):
         if queued[waiting[i]]:
             nearest = min(nearest, distance[waiting[i]] // WIDTH)
@@ -191,7 +192,7 @@ def relax(
     state: Ints,
 ) -> None:
     """Offer all neighbours of u the way through u."""
-    reached, level, own = np.int64(distance[u]), np.int64(levels[u]), label[u]
+    reached, level, own = int(distance[u]), int(levels[u]), label[u]
     touched[u >> 9] = 1
     for k in range(27):
         v = beside(neighbours, u, k)
@@ -200,7 +201,7 @@ def relax(
         if levels[v] == 0 or k == CENTRE:
             continue
         through = reached + COSTS[level + levels[v]] + LENGTHS[k]
-        known = np.int64(distance[v])
+        known = int(distance[v])
         if through > known or through >= UNREACHED:
             continue
         if through == known:
@@ -257,7 +258,7 @@ def settle(
                 continue
             heads[current & MASK] = pool[entry, 1]
             state[1] -= 1
-            u = np.int64(pool[entry, 0])
+            u = int(pool[entry, 0])
             if queued[u]:
                 queued[u] = 0
                 settled += 1
@@ -309,13 +310,13 @@ def repair(
     waiting = np.empty(len(cut) + len(raised) + len(sources), dtype=np.int32)
     count = 0
     for i in range(len(sources)):
-        s = np.int64(sources[i])
+        s = int(sources[i])
         distance[s], previous[s], label[s] = 0, CENTRE, source_label[i]
         queued[s] = 1
         waiting[count] = s
         count += 1
     for i in range(len(cut) + len(raised)):
-        v = np.int64(cut[i] if i < len(cut) else raised[i - len(cut)])
+        v = int(cut[i] if i < len(cut) else raised[i - len(cut)])
         if levels[v] == 0:
             continue
         better = pull(v, levels, neighbours, distance, previous, label)
