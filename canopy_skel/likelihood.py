@@ -12,8 +12,10 @@ from canopy_skel.kernels import ellipsoid
 from canopy_skel.spline import BranchSpline
 from canopy_skel.voxels import Int32Array, VoxelBlocks, grown
 
-BYTES_PER_VOXEL = 128
-"""Sums, rows and what the path search needs per voxel of the map: what the limit counts."""
+BYTES_PER_SLOT = 40
+"""Sums, levels and the path search, with room to grow: what the limit counts per slot."""
+BYTES_PER_VOXEL = 3 * BYTES_PER_SLOT
+"""The same for a voxel that may be new: blocks are about a third full."""
 THICKEST_VOXEL_M = 0.1
 """A larger voxel holds several branches: the map could not tell them apart."""
 
@@ -247,7 +249,7 @@ class LikelihoodMap:
             low = np.minimum(low, 8.0 * self.blocks.origin)
             high = np.maximum(high, 8.0 * (self.blocks.origin + self.blocks.top.shape))
         table = 4.0 * float(np.prod((high - low) / 8.0 + 2.0))
-        needed = (self.blocks.slots + float(support.sum())) * BYTES_PER_VOXEL + table
+        needed = self.blocks.slots * BYTES_PER_SLOT + float(support.sum()) * BYTES_PER_VOXEL + table
         if needed > self._memory_limit_bytes:
             # Further views will add to the map: advise with room for four times as much.
             fits = self._config.voxel_size_m * (4 * needed / self._memory_limit_bytes) ** (1 / 3)

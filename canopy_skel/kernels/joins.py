@@ -66,8 +66,8 @@ def borders_of(
                 v = beside(neighbours, slot, k)
                 if levels[v] == 0 or label[v] == label[slot] or distance[v] == UNREACHED:
                     continue
-                way = int(distance[slot]) + distance[v]
-                way += COSTS[int(levels[slot]) + levels[v]] + LENGTHS[k]
+                way = int(distance[slot]) + int(distance[v])
+                way += COSTS[int(levels[slot]) + int(levels[v])] + LENGTHS[k]
                 low, high = min(label[slot], label[v]), max(label[slot], label[v])
                 pair = 0
                 while pair < pairs and (met[pair, 0] != low or met[pair, 1] != high):
@@ -244,8 +244,8 @@ def join_all(
                 v = beside(neighbours, u, k)
                 if levels[v] == 0 or k == CENTRE:
                     continue
-                step = int(COSTS[int(levels[u]) + levels[v]] + LENGTHS[k])
-                through, known = distance[u] + step, int(distance[v])
+                step = int(COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k])
+                through, known = int(distance[u]) + step, int(distance[v])
                 better = through < known or (through == known and 26 - k < previous[v])
                 relabel = through == known and previous[v] == 26 - k
                 if better or relabel:
@@ -259,15 +259,15 @@ def join_all(
                 if distance[v] != UNREACHED and (
                     root_of(parent, int(label[u])) != root_of(parent, int(label[v]))
                 ):
-                    total = distance[u] + step + distance[v]
+                    total = int(distance[u]) + step + int(distance[v])
                     lower, way = (u, k) if k > CENTRE else (v, 26 - k)
                     heapq.heappush(borders, (total, key_of(places, lower), way, lower))
             continue
         total, _, k, u = heapq.heappop(borders)
         v = beside(neighbours, u, k)
         a, b = root_of(parent, int(label[u])), root_of(parent, int(label[v]))
-        step = int(COSTS[int(levels[u]) + levels[v]] + LENGTHS[k])
-        if a == b or total != distance[u] + step + distance[v]:
+        step = int(COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k])
+        if a == b or total != int(distance[u]) + step + int(distance[v]):
             continue
         path = trace(u << 5 | k, neighbours, previous)
         parent[max(a, b)] = min(a, b)

@@ -70,7 +70,7 @@ def pull(
         u = beside(neighbours, v, k)
         if k == CENTRE or levels[u] == 0 or distance[u] == UNREACHED:
             continue
-        cost = int(distance[u]) + COSTS[levels[u] + levels[v]] + LENGTHS[k]
+        cost = int(distance[u]) + COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k]
         if cost < best or (cost == best and k < through):
             best, through, found = cost, k, u
     if found == 0:
@@ -200,7 +200,7 @@ def relax(
             touched[v >> 9] = 1
         if levels[v] == 0 or k == CENTRE:
             continue
-        through = reached + COSTS[level + levels[v]] + LENGTHS[k]
+        through = reached + COSTS[level + int(levels[v])] + LENGTHS[k]
         known = int(distance[v])
         if through > known or through >= UNREACHED:
             continue
