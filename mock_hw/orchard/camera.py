@@ -47,9 +47,10 @@ def scaled(camera: Camera, scale: float) -> Camera:
         UsageError: the scale leaves no picture.
     """
     one = camera.intrinsics
-    width_px, height_px = round(scale * one.width_px), round(scale * one.height_px)
+    share = scale if 0 < scale <= 1 else 0.0
+    width_px, height_px = round(share * one.width_px), round(share * one.height_px)
     if width_px < 1 or height_px < 1:
-        raise UsageError(f"a camera scaled by {scale} has no pixels; give more than 0, up to 1")
+        raise UsageError(f"a camera scaled by {scale} takes no pictures; give more than 0, up to 1")
     across, down = width_px / one.width_px, height_px / one.height_px
     # Pixel centres are at whole numbers, so the picture's corner is at -0.5.
     return replace(
@@ -101,7 +102,8 @@ def shoot(
     fragments = fragments_in(scene, picture, base_from_camera, intrinsics)
     instances, scores = instances_of(fragments, rng)
     right_pose = base_from_camera @ transform_from(np.eye(3), [camera.baseline_m, 0, 0])
-    right = renderer.draw(scene.mesh, right_pose, intrinsics)
+    both = camera.depth or camera.pair
+    right = renderer.draw(scene.mesh, right_pose, intrinsics) if both else picture
     view = View(
         index=index,
         stamp_ns=stamp_ns,

@@ -4,16 +4,16 @@
 """
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from hashlib import file_digest
 from pathlib import Path
 from typing import Any
 
-from canopy_skel.errors import CanopyError, RecordingError, UsageError
+from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.recording import read_recording
 from mock_hw.orchard.camera import Camera, scaled
+from mock_hw.orchard.files import write_whole
 from mock_hw.orchard.simulate import Options, require_known
 
 MANIFEST = "manifest.json"
@@ -191,18 +191,7 @@ def write_manifest(
             for one in sorted(recordings, key=lambda one: one.file)
         ],
     }
-    part = folder / f".{MANIFEST}.part"
-    try:
-        with part.open("w") as stream:
-            stream.write(json.dumps(document, indent=1) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(part, folder / MANIFEST)
-    except OSError as error:
-        raise RecordingError(
-            f"{folder / MANIFEST}: cannot be written ({error.strerror}); free space, and run again"
-            " to go on"
-        ) from error
+    write_whole(folder / MANIFEST, [(json.dumps(document, indent=1) + "\n").encode()])
 
 
 def flaw_of(folder: Path, one: Recorded) -> str | None:

@@ -4,25 +4,18 @@ Every recording is made in a folder of its own inside the data set, and gets its
 finished; only then does the manifest list it.
 """
 
-import fcntl
-import multiprocessing
 import os
 import shutil
-import signal
 import tempfile
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-
-from canopy_skel.errors import RecordingError, UsageError
+from canopy_skel.errors import RecordingError
 from mock_hw.orchard.dataset import (
     Recorded,
     Settings,
@@ -38,9 +31,9 @@ from mock_hw.orchard.dataset import (
 from mock_hw.orchard.foliage import FoliageFit
 from mock_hw.orchard.record import record, segmented_share
 from mock_hw.orchard.simulate import fit_densities, prepare
+from mock_hw.orchard.workers import alone_in, require_jobs, workers
 
 _UNFINISHED = ".unfinished-"
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,10 +76,9 @@ def produce(
         UsageError: an option is out of range, or the folder holds something else.
         RecordingError: a recording or the manifest cannot be written.
     """
-    if jobs < 1:
-        raise UsageError(f"jobs is {jobs}; give 1 or more")
+    require_jobs(jobs)
     require_possible(wanted, settings)
-    with _alone_in(folder):
+    with alone_in(folder):
         listed = finished(folder, settings, software)
         kept = [
             listed[stand]
@@ -120,7 +112,7 @@ def _made(
     ready: deque[_Order] = deque()
     fitting: dict[Future[tuple[FoliageFit, ...]], list[Stand]] = {}
     recording: set[Future[Recorded]] = set()
-    with _workers(jobs) as pool:
+    with workers(jobs) as pool:
         while trees or ready or fitting or recording:
             while len(fitting) + len(recording) < jobs and (ready or trees):
                 if ready:
@@ -168,64 +160,6 @@ def _make(order: _Order) -> Recorded:
     )
     os.replace(part, order.folder / stand.file)
     return recorded
-
-
-@contextmanager
-def _workers(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Start processes that compute on one thread each and do not outlive this one."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    spawn = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_work) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-    except BrokenProcessPool as error:
-        raise RecordingError(
-            "a process that simulates was killed, perhaps for want of memory; run again to go on,"
-            " with fewer --jobs"
-        ) from error
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _begin_work() -> None:
-    """Prepare a worker: one thread; gone at once when interrupted, or when its parent is."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    cv2.setNumThreads(1)
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        raise RuntimeError("a worker has a parent")
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, name="follow-parent", daemon=True).start()
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder, so that two runs do not make the same recordings."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(
-                f"{folder}: another canopy simulate writes there; wait for it, or choose another"
-                " folder"
-            ) from error
-        yield
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager

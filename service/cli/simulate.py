@@ -122,9 +122,11 @@ def _names(text: str) -> list[str]:
 
 def _topologies(text: str) -> list[int]:
     """Return 0…N-1 for a single number N, else the numbers of a list of ranges."""
-    if text.isdecimal():
-        return _numbers("--topologies", f"0-{int(text) - 1}" if int(text) else "-")
-    return _numbers("--topologies", text)
+    if not text.isdecimal():
+        return _numbers("--topologies", text)
+    if int(text) < 1:
+        raise UsageError(f"--topologies {text}: give 1 or more trees")
+    return _numbers("--topologies", f"0-{int(text) - 1}")
 
 
 def _numbers(option: str, text: str) -> list[int]:
