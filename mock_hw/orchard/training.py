@@ -1,4 +1,4 @@
-"""Labelled pictures to train a branch segmenter on: tree, leaves, light and camera drawn anew."""
+"""Labelled pictures to train a branch segmenter on: tree, tints, light and camera drawn anew."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +9,7 @@ from canopy_skel.frame import UInt8Array
 from canopy_skel.geometry import BoolArray, FloatArray, transform_from
 from mock_hw.orchard.camera import Camera, Shot, shoot
 from mock_hw.orchard.foliage import MOST_LEAVES
+from mock_hw.orchard.kernels import texture
 from mock_hw.orchard.light import any_weather
 from mock_hw.orchard.path import look_at
 from mock_hw.orchard.presets import SPECIES
@@ -16,6 +17,7 @@ from mock_hw.orchard.scene import Scene, build_scene
 from mock_hw.orchard.tree import TRUNK_X_M, grow
 
 FRAMES_PER_SCENE = 4
+_SHADE, _TINT, _BRIGHTEST = 0.25, 0.12, 0.6
 FIRST_FITTING_TOPOLOGY = 100
 """Trees from here on are for training and fitting; those before it are for experiments."""
 
@@ -53,7 +55,7 @@ def scene_frames(
 
 
 def _any_scene(name: str, topology: int, rng: np.random.Generator) -> Scene:
-    return build_scene(
+    scene = build_scene(
         grow(SPECIES[name], topology),
         int(MOST_LEAVES[name] * 0.7 * rng.random() ** 2),
         any_weather(rng),
@@ -61,6 +63,15 @@ def _any_scene(name: str, topology: int, rng: np.random.Generator) -> Scene:
         rows=bool(rng.random() < 0.8),
         trellis=bool(rng.random() < 0.5),
     )
+    return replace(scene, palette=_tinted(scene.palette, rng))
+
+
+def _tinted(palette: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Draw other tints of bark, leaves, fruit, ground and hedge; the light stays as it is."""
+    shade = rng.normal(0, _SHADE, (len(palette), 1)) + rng.normal(0, _TINT, palette.shape)
+    lit = [texture.SUN, texture.SKY, texture.HORIZON]
+    shade[lit] = 0
+    return np.asarray(np.minimum(palette * np.exp(shade), np.maximum(palette, _BRIGHTEST)))
 
 
 def _any_pose(rng: np.random.Generator) -> FloatArray:

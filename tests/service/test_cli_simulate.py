@@ -139,8 +139,8 @@ def is_running(pid):
         (["--wind", "nan"], "wind_m is nan; give 0 or more"),
         (["--seed", "-1"], "seed is -1; give 0 or more"),
         (["--jobs", "0"], "jobs is 0; give 1 or more"),
-        (["--picture-scale", "0"], "a camera scaled by 0.0 takes no pictures; give more than 0"),
-        (["--picture-scale", "nan"], "a camera scaled by nan takes no pictures"),
+        (["--picture-scale", "0"], "no pictures scaled by 0.0; give more than 0"),
+        (["--picture-scale", "nan"], "no pictures scaled by nan"),
     ],
 )
 def test_bad_options_of_simulate_are_one_line(canopy, tmp_path, arguments, message):

@@ -110,7 +110,7 @@ def test_another_data_set_in_the_folder_is_not_touched(folder):
         (1, {}, 0, "jobs is 0; give 1 or more"),
         (1, {"species": ("pear",)}, 1, "unknown species 'pear'"),
         (1, {"seed": -1}, 1, "seed is -1; give 0 or more"),
-        (1, {"picture_scale": 0.0}, 1, "takes no pictures"),
+        (1, {"picture_scale": 0.0}, 1, "no pictures scaled by 0.0"),
     ],
 )
 def test_impossible_data_sets_are_refused_before_any_work(tmp_path, count, change, jobs, message):
