@@ -12,14 +12,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from canopy_skel.errors import RecordingError
 from mock_hw.orchard.dataset import (
+    LeafyTree,
     Recorded,
     Settings,
-    Stand,
     finished,
     flaw_of,
     metadata_of,
@@ -44,11 +45,11 @@ class Produced:
     made: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class _Order:
     """What a worker needs to know to make one recording."""
 
-    stand: Stand
+    tree: LeafyTree
     settings: Settings
     software: str
     fit: FoliageFit
@@ -57,7 +58,7 @@ class _Order:
 
 
 def produce(
-    folder: Path, wanted: Sequence[Stand], settings: Settings, *, software: str, jobs: int
+    folder: Path, wanted: Sequence[LeafyTree], settings: Settings, *, software: str, jobs: int
 ) -> Iterator[Produced]:
     """Yield the recordings of a data set as they are finished, what is there already first.
 
@@ -81,36 +82,35 @@ def produce(
     with alone_in(folder):
         listed = finished(folder, settings, software)
         kept = [
-            listed[stand]
-            for stand in wanted
-            if stand in listed and flaw_of(folder, listed[stand]) is None
+            listed[tree]
+            for tree in wanted
+            if tree in listed and flaw_of(folder, listed[tree]) is None
         ]
-        missing = [stand for stand in wanted if stand not in {one.stand for one in kept}]
-        for stand in missing:
-            if stand not in listed and (folder / stand.file).exists():
-                require_ours(folder / stand.file, stand, settings, software)
+        missing = [tree for tree in wanted if tree not in {one.tree for one in kept}]
+        for tree in missing:
+            if tree not in listed and (folder / tree.file).exists():
+                require_ours(folder / tree.file, tree, settings, software)
         for one in kept:
             yield Produced(recorded=one, made=False)
-        listed = {stand: one for stand, one in listed.items() if stand not in missing}
+        listed = {tree: one for tree, one in listed.items() if tree not in missing}
         write_manifest(folder, listed.values(), settings, software)
         with _unfinished_in(folder) as unfinished:
-
-            def order(stand: Stand, fit: FoliageFit) -> _Order:
-                return _Order(stand, settings, software, fit, folder, unfinished)
-
+            order = partial(
+                _Order, settings=settings, software=software, folder=folder, unfinished=unfinished
+            )
             for one in _made(missing, order, jobs):
-                listed[one.stand] = one
+                listed[one.tree] = one
                 write_manifest(folder, listed.values(), settings, software)
                 yield Produced(recorded=one, made=True)
 
 
 def _made(
-    missing: Sequence[Stand], order: Callable[[Stand, FoliageFit], _Order], jobs: int
+    missing: Sequence[LeafyTree], order: Callable[..., _Order], jobs: int
 ) -> Iterator[Recorded]:
     """Yield recordings as they are finished; one fit serves all densities of a tree."""
     trees = deque(_by_tree(missing))
     ready: deque[_Order] = deque()
-    fitting: dict[Future[tuple[FoliageFit, ...]], list[Stand]] = {}
+    fitting: dict[Future[tuple[FoliageFit, ...]], list[LeafyTree]] = {}
     recording: set[Future[Recorded]] = set()
     with workers(jobs) as pool:
         while trees or ready or fitting or recording:
@@ -119,46 +119,46 @@ def _made(
                     recording.add(pool.submit(_make, ready.popleft()))
                 else:
                     own = trees.popleft()
-                    densities = [stand.foliage for stand in own]
-                    fit = pool.submit(fit_densities, own[0].species, own[0].topology, densities)
-                    fitting[fit] = own
+                    densities = [tree.foliage for tree in own]
+                    job = pool.submit(fit_densities, own[0].species, own[0].topology, densities)
+                    fitting[job] = own
             under_way: list[Future[Any]] = [*fitting, *recording]
             wait(under_way, return_when=FIRST_COMPLETED)
-            for fit in [one for one in fitting if one.done()]:
-                own = fitting.pop(fit)
-                ready.extend(map(order, own, fit.result()))
+            for fitted in [one for one in fitting if one.done()]:
+                pairs = zip(fitting.pop(fitted), fitted.result(), strict=True)
+                ready.extend(order(tree=tree, fit=fit) for tree, fit in pairs)
             for made in [one for one in recording if one.done()]:
                 recording.remove(made)
                 yield made.result()
 
 
-def _by_tree(wanted: Iterable[Stand]) -> list[list[Stand]]:
-    trees: dict[tuple[str, int], list[Stand]] = {}
-    for stand in wanted:
-        trees.setdefault((stand.species, stand.topology), []).append(stand)
+def _by_tree(wanted: Iterable[LeafyTree]) -> list[list[LeafyTree]]:
+    trees: dict[tuple[str, int], list[LeafyTree]] = {}
+    for tree in wanted:
+        trees.setdefault((tree.species, tree.topology), []).append(tree)
     return list(trees.values())
 
 
 def _make(order: _Order) -> Recorded:
     """Make one recording, in a worker."""
-    stand, settings = order.stand, order.settings
-    part = order.unfinished / stand.file
-    simulation = prepare(stand.options(settings), order.fit)
-    truth = record(simulation, part, metadata_of(stand, settings, order.software))
+    tree, settings = order.tree, order.settings
+    part = order.unfinished / tree.file
+    simulation = prepare(tree.options(settings), order.fit)
+    truth = record(simulation, part, metadata_of(tree, settings, order.software))
     recorded = Recorded(
-        file=stand.file,
+        file=tree.file,
         sha256=sha256_of(part),
         bytes=part.stat().st_size,
-        species=stand.species,
-        topology=stand.topology,
-        foliage=stand.foliage,
+        species=tree.species,
+        topology=tree.topology,
+        foliage=tree.foliage,
         views=settings.views,
         leaf_count=order.fit.leaf_count,
         v_det=round(order.fit.v_det, 6),
         v_det_target=order.fit.target,
         segmented=round(segmented_share(truth), 6),
     )
-    os.replace(part, order.folder / stand.file)
+    os.replace(part, order.folder / tree.file)
     return recorded
 
 

@@ -45,13 +45,13 @@ def simulate(
     Run again after an interruption, it goes on where it stopped.
     """
     # Imported here: only this command simulates, and what draws takes long to load.
-    from mock_hw.orchard.dataset import Settings, stands
+    from mock_hw.orchard.dataset import Settings, leafy_trees
     from mock_hw.orchard.production import produce
 
     if check:
         _check(output, as_json=as_json)
         return
-    wanted = stands(
+    wanted = leafy_trees(
         _names(species),
         _topologies(topologies),
         _numbers("--foliage", foliage),

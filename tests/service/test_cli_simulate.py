@@ -73,7 +73,7 @@ def test_a_check_makes_nothing_and_names_what_is_damaged(canopy, folder, tmp_pat
     (tmp_path / "manifest.json").write_bytes((folder / "manifest.json").read_bytes())
     code, _, err = canopy("simulate", "-o", tmp_path, "--check")
     assert code == 1
-    assert "walnut_003_fd1.mcap: is missing" in err
+    assert "walnut_003_fd1.mcap: cannot be read (No such file or directory)" in err
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
 
 

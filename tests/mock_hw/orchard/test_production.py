@@ -13,13 +13,13 @@ from canopy_skel.recording import read_recording
 from mock_hw.orchard.census import as_table, density_rows
 from mock_hw.orchard.dataset import (
     MANIFEST,
+    LeafyTree,
     Settings,
-    Stand,
     flaw_of,
+    leafy_trees,
     read_manifest,
     recorded_in,
     sha256_of,
-    stands,
 )
 from mock_hw.orchard.foliage import FoliageFit
 from mock_hw.orchard.production import produce
@@ -28,10 +28,10 @@ from mock_hw.orchard.simulate import fit_densities, prepare, shots, truth
 
 SETTINGS = Settings(picture_scale=0.125, seed=5, wind_m=0.01)
 SOFTWARE = "canopy-skel test"
-STANDS = stands(["walnut"], [3], [1, 4])
+TREES = leafy_trees(["walnut"], [3], [1, 4])
 
 
-def run(folder, wanted=STANDS, settings=SETTINGS, jobs=1, software=SOFTWARE):
+def run(folder, wanted=TREES, settings=SETTINGS, jobs=1, software=SOFTWARE):
     return list(produce(folder, wanted, settings, software=software, jobs=jobs))
 
 
@@ -55,13 +55,15 @@ def copy(folder, tmp_path):
 def test_the_instances_of_full_pictures_cover_v_det_of_the_tree(species):
     (fit,) = fit_densities(species, 1, [3])
     assert fit.v_det == pytest.approx(fit.target, abs=0.03)
-    options = replace(Stand(species=species, topology=1, foliage=3).options(Settings()), rows=False)
+    options = replace(
+        LeafyTree(species=species, topology=1, foliage=3).options(Settings()), rows=False
+    )
     assert segmented_share(truth(prepare(options, fit))) == fit.v_det
 
 
 def test_the_first_tree_of_every_species_comes_first():
-    wanted = stands(["apple", "oak"], [0, 1], [2, 3])
-    assert [stand.file for stand in wanted[:5]] == [
+    wanted = leafy_trees(["apple", "oak"], [0, 1], [2, 3])
+    assert [tree.file for tree in wanted[:5]] == [
         "apple_000_fd2.mcap",
         "apple_000_fd3.mcap",
         "oak_000_fd2.mcap",
@@ -74,12 +76,12 @@ def test_the_manifest_says_what_is_there(folder):
     manifest = read_manifest(folder)
     assert manifest["software"] == SOFTWARE
     assert manifest["settings"] == asdict(SETTINGS)
-    assert set(contents(folder)) == {MANIFEST, *(stand.file for stand in STANDS)}
-    for entry, stand in zip(manifest["recordings"], STANDS, strict=True):
+    assert set(contents(folder)) == {MANIFEST, *(tree.file for tree in TREES)}
+    for entry, tree in zip(manifest["recordings"], TREES, strict=True):
         assert (entry["species"], entry["topology"], entry["foliage"]) == (
             "walnut",
             3,
-            stand.foliage,
+            tree.foliage,
         )
         assert entry["sha256"] == sha256_of(folder / entry["file"])
         assert entry["options"] == asdict(SETTINGS)
@@ -95,11 +97,11 @@ def test_a_recording_holds_the_views_and_the_truth_of_the_simulation(folder):
     assert recording.metadata["tree_id"] == "walnut_003"
     assert recording.metadata["software"] == SOFTWARE
     assert json.loads(recording.metadata["simulation"]) == {
-        **asdict(STANDS[0]),
+        **asdict(TREES[0]),
         **asdict(SETTINGS),
     }
     fit = FoliageFit(density=1, leaf_count=entry["leaf_count"], v_det=0.7, target=0.7)
-    simulation = prepare(STANDS[0].options(SETTINGS), fit)
+    simulation = prepare(TREES[0].options(SETTINGS), fit)
     assert recording.scan_id == simulation.scan_id
     for view, shot in zip(recording.views(), shots(simulation), strict=True):
         assert np.array_equal(view.instances, shot.view.instances)
@@ -119,21 +121,21 @@ def test_what_is_damaged_or_was_not_listed_when_it_was_killed_is_made_again(fold
     manifest = read_manifest(copy)
     del manifest["recordings"][0]
     (copy / MANIFEST).write_text(json.dumps(manifest))
-    data = bytearray((copy / STANDS[1].file).read_bytes())
+    data = bytearray((copy / TREES[1].file).read_bytes())
     data[len(data) // 2] ^= 1
-    (copy / STANDS[1].file).write_bytes(data)
+    (copy / TREES[1].file).write_bytes(data)
     (copy / ".unfinished-killed").mkdir()
-    (copy / ".unfinished-killed" / STANDS[0].file).write_bytes(b"half")
+    (copy / ".unfinished-killed" / TREES[0].file).write_bytes(b"half")
     assert [one.made for one in run(copy, jobs=2)] == [True, True]
     assert contents(copy) == contents(folder)
 
 
 def test_a_check_names_what_is_missing_or_damaged(copy):
-    (copy / STANDS[0].file).unlink()
-    (copy / STANDS[1].file).write_bytes(b"")
+    (copy / TREES[0].file).unlink()
+    (copy / TREES[1].file).write_bytes(b"")
     assert [flaw_of(copy, one) for one in recorded_in(read_manifest(copy))] == [
-        f"{copy / STANDS[0].file}: is missing",
-        f"{copy / STANDS[1].file}: has other bytes than the manifest says",
+        f"{copy / TREES[0].file}: cannot be read (No such file or directory)",
+        f"{copy / TREES[1].file}: has other bytes than the manifest says",
     ]
 
 
@@ -141,7 +143,7 @@ def test_a_finished_data_set_is_left_as_it_is(folder):
     before = contents(folder)
     assert [one.made for one in run(folder)] == [False, False]
     assert contents(folder) == before
-    run(folder, wanted=STANDS[:1])
+    run(folder, wanted=TREES[:1])
     assert contents(folder) == before
 
 
@@ -160,14 +162,14 @@ def test_other_recordings_in_the_folder_are_not_touched(folder, change, message)
 
 
 def test_a_recording_of_somebody_else_is_not_replaced(tmp_path):
-    (tmp_path / STANDS[0].file).write_bytes(b"precious")
+    (tmp_path / TREES[0].file).write_bytes(b"precious")
     with pytest.raises(UsageError, match=r"walnut_003_fd1.mcap: is there already and was not made"):
         run(tmp_path)
-    assert contents(tmp_path) == {STANDS[0].file: b"precious"}
+    assert contents(tmp_path) == {TREES[0].file: b"precious"}
 
 
 def test_two_runs_do_not_share_a_folder(folder):
-    first = produce(folder, STANDS, SETTINGS, software=SOFTWARE, jobs=1)
+    first = produce(folder, TREES, SETTINGS, software=SOFTWARE, jobs=1)
     next(first)
     with pytest.raises(UsageError, match="another canopy writes there"):
         run(folder)
