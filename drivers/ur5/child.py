@@ -10,7 +10,6 @@ thread owns the receive interface, sends every package to the parent and ends th
 """
 
 import os
-import signal
 import socket
 import struct
 import sys
@@ -53,7 +52,6 @@ def probe(host: str, timeout_s: float = 1.0) -> tuple[str, str] | None:
 
 def main(pipe: Connection) -> NoReturn:
     """Serve the parent until it goes away."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     config: Ur5Config = pipe.recv()
     parent, record = Parent(pipe), MoveRecord()
     problem = probe(config.host)
