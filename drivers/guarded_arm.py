@@ -74,6 +74,10 @@ class GuardedArm:
         """Return the state of the arm."""
         return self._arm.state()
 
+    def check(self) -> None:
+        """Raise what keeps the arm from moving."""
+        self._arm.check()
+
     def stop(self) -> None:
         """Stop the arm."""
         self._arm.stop()

@@ -140,9 +140,17 @@ class ViewFeeder:
             self._changed.notify_all()
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until every offered view has arrived and its skeleton is here; say whether so."""
+        """Wait until every offered view has arrived and its skeleton is here; say whether so.
+
+        Without a worker there is nothing to wait for.
+        """
+        until_s = time.monotonic() + timeout_s
         with self._changed:
-            return self._changed.wait_for(self._complete, timeout_s)
+            while not self._complete():
+                if not self._watch.workers() or time.monotonic() > until_s:
+                    return False
+                self._changed.wait(_TICK_S)
+        return True
 
     def workers(self) -> tuple[WorkerSeen, ...]:
         """Return the workers that are there now, as they last reported."""

@@ -65,8 +65,8 @@ class ScanSession:
     """Drives one scan from where it is to its end, or until it is interrupted or stopped.
 
     `report(kind, fields)` is told of everything that happens, from the session's thread;
-    `recorded(index)` that a view is safe on disk; `conclude_with(state)` is called before the scan
-    is said to have ended.
+    `recorded(index)` that a view is safe on disk; `conclude_with(state, detail)` is called before
+    the scan is said to have ended, and when nothing moves any more.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ScanSession:
         *,
         report: Report,
         recorded: Callable[[int], None],
-        conclude_with: Callable[[ScanState], None] = lambda state: None,
+        conclude_with: Callable[[ScanState, str], None] = lambda state, detail: None,
     ) -> None:
         self.path = path
         self._spec = spec
@@ -140,13 +140,22 @@ class ScanSession:
         except ScanInterruptedError:
             self._end(self._wanted or ScanState.PAUSED, "")
         except (DriverError, CanopyError, PictureRefusedError) as error:
-            # An interruption makes the driver complain of the move it cut short.
-            interrupted = self._wanted is not None
-            state = (self._wanted or ScanState.STOPPED) if interrupted else ScanState.STOPPED
-            self._end(state, "" if interrupted else f"{type(error).__name__}: {error}")
+            if self._wanted is None:
+                self._end(ScanState.STOPPED, self._drop_motion(error))
+            else:  # the interruption makes the driver complain of the move it cut short
+                self._end(self._wanted, "")
         except Exception as error:
             log.exception("scan %s failed", self._spec.scan_id)
-            self._end(ScanState.FAILED, f"{type(error).__name__}: {error}")
+            self._end(ScanState.FAILED, self._drop_motion(error))
+
+    def _drop_motion(self, error: Exception) -> str:
+        """Stop the arm, whatever the error left of a move; return what the operator must know."""
+        detail = f"{type(error).__name__}: {error}"
+        try:
+            self._tools.arm.stop()
+        except DriverError as unstopped:
+            return f"{detail}; {unstopped}"
+        return detail
 
     def _scan(self) -> None:
         metadata = {"scan_id": self._spec.scan_id, "tree_id": self._spec.tree_id}
@@ -218,7 +227,7 @@ class ScanSession:
             before = after
         raise PictureRefusedError(
             f"waypoint {index}: {'; '.join(reasons)}; clean the lens, light the tree or move the"
-            " waypoint, then resume"
+            " waypoint, then acknowledge and resume"
         )
 
     def _view(self, index: int, image: CameraImage, state: ArmState) -> View:
@@ -243,7 +252,7 @@ class ScanSession:
         self._report(kind, fields)
 
     def _end(self, state: ScanState, detail: str) -> None:
-        self._conclude_with(state)
+        self._conclude_with(state, detail)
         with self._lock:
             self._state, self._detail = state, detail
         self._report(str(state), {"detail": detail} if detail else {})

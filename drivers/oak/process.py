@@ -1,5 +1,6 @@
 """The parent's side of one camera process: start it, hear it with a deadline, end it."""
 
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ class CameraProcess:
     """A child that is running until `close`, or until it is found dead or hanging.
 
     The child speaks only while it opens the device and while it owes a picture, so nothing has to
-    be read in between; whether it lives is found out when it is asked.
+    be read in between; but it may say that it ends.
     """
 
     def __init__(self, config: OakConfig, command: Sequence[str]) -> None:
@@ -44,7 +45,7 @@ class CameraProcess:
             NoCameraError: the child has ended or hangs; it must be closed.
         """
         patience_s = self._config.silence_s if self.ready else self._config.open_timeout_s
-        silent_s = self._heard_s + patience_s
+        silent_s = self._heard_s + patience_s if self._owes or not self.ready else math.inf
         try:
             if not self._child.pipe.poll(max(0.0, min(until_s, silent_s) - time.perf_counter())):
                 if time.perf_counter() < silent_s:
