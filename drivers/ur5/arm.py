@@ -148,7 +148,7 @@ class Ur5Arm:
             self._stopped_move = self._move
         if pending.wait(self._config.stop_timeout_s) is None:
             if link.up:
-                link.kill()
+                link.kill("did not confirm a stop and was ended")
             try:
                 self._dashboard.ask("stop")
             except OSError as error:
@@ -236,7 +236,7 @@ class Ur5Arm:
         """Replace a child that does not answer; the program on the controller is ended."""
         link = self._connected()
         if link.up:
-            link.kill()
+            link.kill(f"{what} and was ended")
             return DriverProcessError(f"the arm's driver process {what} and was ended")
         return link.why_down()
 

@@ -61,6 +61,7 @@ class ChildLink:
         self._number = 0
         self._up = False
         self._down: ArmLinkError | None = None
+        self._why_killed = ""
         self._closing = threading.Event()
         self._supervisor = threading.Thread(target=self._supervise, name="ur5-link", daemon=True)
 
@@ -116,10 +117,11 @@ class ChildLink:
             self._child.send(Command(self._number, request))
         return pending
 
-    def kill(self) -> None:
+    def kill(self, why: str = "") -> None:
         """End the present child without asking it; another is started unless closing."""
         child = self._child
         if child is not None:
+            self._why_killed = why
             child.kill()
 
     def _supervise(self) -> None:
@@ -135,6 +137,7 @@ class ChildLink:
 
     def _spawn(self) -> Child:
         child = self._child = Child(_COMMAND)
+        self._why_killed = ""
         if self._closing.is_set():
             child.kill()
         child.send(self._config)
@@ -150,7 +153,8 @@ class ChildLink:
                 answer: Answer = child.pipe.recv()
             except (EOFError, OSError):
                 code = child.exit_code(_LEAVE_S)
-                return DriverProcessError(f"the arm's driver process died (exit code {code})")
+                why = self._why_killed or f"died (exit code {code})"
+                return DriverProcessError(f"the arm's driver process {why}")
             if isinstance(answer, Farewell):
                 cause: type[ArmLinkError] = getattr(errors, answer.error)
                 return cause(answer.text)
