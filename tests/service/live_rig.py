@@ -56,9 +56,9 @@ class Rig:
         return answer.json()["scan_id"]
 
     def start_slowly(self):
-        """A scan of three waypoints, with half a second on the way to each."""
+        """A scan of three waypoints, with a third of a second on the way to each."""
         poses = PATHS["orchard-70"][:3]
-        return self.start(waypoints=[waypoint(pose) for pose in poses], speed_mps=0.01)
+        return self.start(waypoints=[waypoint(pose) for pose in poses], speed_mps=0.02)
 
     def status(self, scan_id):
         return self.http.get(f"/v1/scans/{scan_id}").json()
