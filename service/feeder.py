@@ -281,7 +281,13 @@ class ViewFeeder:
 
     def _recorded(self, source: ScanSource, index: int) -> tuple[Message, ...]:
         """Read a view from the recording, which is looked through anew only if need be."""
-        path = source.recording()
+        try:
+            return self._read(source.recording(), index)
+        except RecordingError:
+            # The scan may just have ended, which renames its recording.
+            return self._read(source.recording(), index)
+
+    def _read(self, path: Path, index: int) -> tuple[Message, ...]:
         known = self._recording
         if known is None or known.path != path or index not in {g.index for g in known.groups}:
             known = self._recording = read_recording(path)

@@ -4,7 +4,7 @@ import logging
 import shutil
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -28,7 +28,7 @@ from service.rig import (
     UnknownScanError,
     WaypointVerdict,
 )
-from service.scan import ScanSession, ScanTools
+from service.scan import ScanSession, ScanTools, Stage
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +72,7 @@ class RigParts:
     feed: Feed
     data: Path
     attachments: Callable[[], Mapping[str, bytes]] = dict
+    stage: Stage = lambda name: nullcontext()
 
 
 class LocalRig:
@@ -237,6 +238,7 @@ class LocalRig:
                 limits=parts.limits,
                 tool_from_camera=parts.tool_from_camera,
                 attachments=parts.attachments,
+                stage=parts.stage,
             ),
             self._path(spec.scan_id),
             report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),

@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,6 +36,7 @@ from service.rig import ScanSpec, ScanState, ScanStatus
 log = logging.getLogger(__name__)
 
 Report = Callable[[str, dict[str, object]], None]
+Stage = Callable[[str], AbstractContextManager[None]]
 
 
 class ScanInterruptedError(Exception):
@@ -50,7 +52,7 @@ class ScanTools:
     """What a scan works with.
 
     tool_from_camera: (4, 4), the hand-eye calibration. attachments: files that go with the finished
-    recording, by name; of a simulation the truth.
+    recording, by name; of a simulation the truth. stage: entered around each step, by its name.
     """
 
     arm: Arm
@@ -59,6 +61,7 @@ class ScanTools:
     tool_from_camera: FloatArray
     quality: QualityLimits = field(default_factory=QualityLimits)
     attachments: Callable[[], Mapping[str, bytes]] = dict
+    stage: Stage = lambda name: nullcontext()
 
 
 class ScanSession:
@@ -181,46 +184,54 @@ class ScanSession:
         self._end(ScanState.DONE, "")
 
     def _visit_all(self, writer: RecordingWriter) -> None:
+        stage = self._tools.stage
         for index, waypoint in enumerate(self._spec.waypoints):
             if index in self._done:
                 continue
             self._check_wanted()
             state = self._drive_to(waypoint)
             view = self._capture(index, state, writer)
-            writer.write_view(view)
+            with stage("record"):
+                writer.write_view(view)
             with self._lock:
                 self._done.add(index)
-            self._recorded(index)
-            self._note(writer, "view", index=index)
+            with stage("bus"):
+                self._recorded(index)
+            with stage("journal"):
+                self._note(writer, "view", index=index)
 
     def _drive_to(self, waypoint: FloatArray) -> ArmState:
-        arm, spec = self._tools.arm, self._spec
-        state = arm.state()
-        raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
-        moves = moves_to(
-            state,
-            waypoint,
-            self._tools.limits,
-            speed_mps=spec.speed_mps,
-            acceleration_mps2=spec.acceleration_mps2,
-        )
+        arm, spec, stage = self._tools.arm, self._spec, self._tools.stage
+        with stage("plan"):
+            state = arm.state()
+            raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
+            moves = moves_to(
+                state,
+                waypoint,
+                self._tools.limits,
+                speed_mps=spec.speed_mps,
+                acceleration_mps2=spec.acceleration_mps2,
+            )
         for move in moves:
-            with self._lock:
+            with stage("command"), self._lock:
                 self._check_wanted()
                 arm.start_move(move)
-            state = wait_settled(arm, timeout_s=spec.settle_timeout_s)
+            with stage("settle"):
+                state = wait_settled(arm, timeout_s=spec.settle_timeout_s)
         return state
 
     def _capture(self, index: int, before: ArmState, writer: RecordingWriter) -> View:
         reasons: list[str] = []
         for attempt in range(self._spec.retakes + 1):
             self._check_wanted()
-            image = self._tools.camera.grab(self._spec.grab_timeout_s)
-            after = self._tools.arm.state()
-            shift = moved(
-                before.pose.base_from_tool0, after.pose.base_from_tool0, self._tools.quality
-            )
-            reasons = [*flaws(image, self._tools.quality), *([shift] if shift else [])]
+            with self._tools.stage("grab"):
+                image = self._tools.camera.grab(self._spec.grab_timeout_s)
+            with self._tools.stage("gate"):
+                after = self._tools.arm.state()
+                shift = moved(
+                    before.pose.base_from_tool0, after.pose.base_from_tool0, self._tools.quality
+                )
+                reasons = [*flaws(image, self._tools.quality), *([shift] if shift else [])]
             if not reasons:
                 return self._view(index, image, after)
             self._note(writer, "retake", index=index, attempt=attempt, reasons=reasons)

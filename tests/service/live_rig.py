@@ -148,6 +148,11 @@ class Rig:
         wait_until_ready(self.http)
 
 
+def environment():
+    """Have a process find the modules that we find, not those installed elsewhere."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
 def waypoint(base_from_tool0):
     """A pose as requests have it."""
     return {
@@ -219,7 +224,7 @@ class Service:
     def launch(self):
         port = free_port()
         command = [*map(str, self._command), "--port", str(port)]
-        self.process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        self.process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment())
         self.http = httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0)
         wait_until_answering(self.http)
         return Rig(self.http, None, self._data)

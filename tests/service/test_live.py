@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from live_rig import Service, problem, processes, served, wait_until_ready
+from live_rig import Service, environment, problem, processes, served, wait_until_ready
 
 from canopy_skel.recording import read_recording
 
@@ -126,7 +126,12 @@ def test_a_scan_from_the_shell_brings_recording_and_skeleton(rig, tmp_path):
     command = [Path(sys.executable).with_name("canopy"), "scan", "--json", "--tree", "t3"]
     command += ["--url", str(rig.http.base_url), "-o", tmp_path]
     result = subprocess.run(
-        [*map(str, command)], capture_output=True, text=True, check=False, timeout=200
+        [*map(str, command)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+        env=environment(),
     )
     assert result.returncode == 0, result.stderr
     scanned = json.loads(result.stdout)
