@@ -67,7 +67,10 @@ async def _run(arguments: argparse.Namespace) -> None:
 
 
 def _start_cycle(controller: Controller, network: Network, streams: rtde.RtdeServer) -> None:
-    """Tick at the controller's rate; cycles missed on a busy host are made up for at once."""
+    """Tick as often as somebody looks, at the controller's rate at most.
+
+    Cycles in between, and those missed on a busy host, are made up for at once.
+    """
     loop = asyncio.get_running_loop()
     start_s = loop.time()
 
@@ -77,7 +80,8 @@ def _start_cycle(controller: Controller, network: Network, streams: rtde.RtdeSer
             controller.tick(due - controller.cycle)
             if not network.frozen:
                 streams.stream()
-        loop.call_at(start_s + (controller.cycle + 1) * controller.period_s, cycle)
+        next_s = controller.cycle * controller.period_s + streams.shortest_period_s()
+        loop.call_at(start_s + next_s, cycle)
 
     cycle()
 

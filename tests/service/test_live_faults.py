@@ -176,7 +176,7 @@ def test_a_camera_unplugged_while_nothing_runs_is_seen_before_the_arm_moves(rig,
     rig.assert_stands_still()
     oak_behaviour.write_text("well")
     wait_for(lambda: rig.part("camera")["ready"], "the camera is not found again")
-    rig.wait(rig.start(), "done", views=10)
+    rig.wait(rig.start_slowly(), "done", views=3)
 
 
 def test_a_worker_that_stalls_holds_nothing_up_and_catches_up(rig, tmp_path):
