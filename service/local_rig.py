@@ -102,7 +102,10 @@ class LocalRig:
         for scan_id in [*self._sessions]:
             session = self._sessions[scan_id][1]
             if session.status.state is ScanState.RUNNING:
-                self._interrupt(session, ScanState.PAUSED)
+                try:
+                    self._interrupt(session, ScanState.PAUSED)
+                except RigNotReadyError as error:
+                    log.warning("scan %s: %s", scan_id, error)
         self._open.close()
 
     def plan(self, spec: ScanSpec) -> list[WaypointVerdict]:
@@ -111,7 +114,7 @@ class LocalRig:
             self._arm.open()
             state = self._parts.arm.state()
         except DriverError as error:
-            raise RigNotReadyError(f"arm: {type(error).__name__}: {error}") from error
+            raise _not_ready(error) from error
         verdicts = []
         for index, waypoint in enumerate(spec.waypoints):
             try:
@@ -172,10 +175,13 @@ class LocalRig:
         """Stop the arm now, whatever is under way; an acknowledgement is needed afterwards."""
         self._stopped = "the arm was stopped by the operator"
         running = [s for _, s in self._sessions.values() if s.status.state is ScanState.RUNNING]
-        if not running:
-            self._parts.arm.stop()
-        for session in running:
-            session.interrupt(ScanState.STOPPED)
+        try:
+            if not running:
+                self._parts.arm.stop()
+            for session in running:
+                session.interrupt(ScanState.STOPPED)
+        except DriverError as error:
+            raise _not_ready(error) from error
 
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again; a scan goes on only by `resume`."""
@@ -183,7 +189,7 @@ class LocalRig:
             self._arm.open()
             self._parts.arm.acknowledge(reason)
         except DriverError as error:
-            raise RigNotReadyError(f"arm: {type(error).__name__}: {error}") from error
+            raise _not_ready(error) from error
         self._stopped = ""
         self._tell("", "acknowledged", {"reason": reason})
 
@@ -254,7 +260,10 @@ class LocalRig:
             self._stopped = f"the scan was stopped ({detail})"
 
     def _interrupt(self, session: ScanSession, wanted: ScanState) -> None:
-        session.interrupt(wanted)
+        try:
+            session.interrupt(wanted)
+        except DriverError as error:
+            raise _not_ready(error) from error
         if not session.join(STOP_TIMEOUT_S):
             raise RigNotReadyError(
                 "the arm was told to stop but the scan has not ended within"
@@ -301,6 +310,10 @@ class LocalRig:
         event = RigEvent(scan_id=scan_id, kind=kind, fields=fields)
         for listener in self._listeners:
             listener(event)
+
+
+def _not_ready(error: DriverError) -> RigNotReadyError:
+    return RigNotReadyError(f"arm: {type(error).__name__}: {error}")
 
 
 def _trouble(device: Opened) -> str:

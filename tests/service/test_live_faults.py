@@ -103,6 +103,9 @@ def test_the_controller_is_killed_in_mid_move(rig):
         refused = rig.acknowledge()
         assert problem(refused, 503) == "rig_not_ready"
         assert re.search(gone, refused.json()["detail"])
+        unheard = rig.http.post("/v1/rig:stop")
+        assert problem(unheard, 503) == "rig_not_ready"
+        assert "use the emergency stop" in unheard.json()["detail"]
     finally:
         rig.controller.__enter__()
     rig.assert_one_acknowledgement_lets_it_go_on(scan_id)
