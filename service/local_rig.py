@@ -183,6 +183,10 @@ class LocalRig:
         except DriverError as error:
             raise _not_ready(error) from error
 
+    def hold(self, reason: str) -> None:
+        """Let nothing move until somebody has acknowledged; an earlier reason stays."""
+        self._stopped = self._stopped or reason
+
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again; a scan goes on only by `resume`."""
         try:
@@ -256,8 +260,8 @@ class LocalRig:
         """Let the last views become a skeleton; hold the arm after what nobody asked for."""
         if state is ScanState.DONE and not self._parts.feed.flush(SKELETON_TIMEOUT_S):
             log.warning("the skeleton of the last views is not there yet")
-        if state in (ScanState.STOPPED, ScanState.FAILED) and detail and not self._stopped:
-            self._stopped = f"the scan was stopped ({detail})"
+        if state in (ScanState.STOPPED, ScanState.FAILED) and detail:
+            self.hold(f"the scan was stopped ({detail})")
 
     def _interrupt(self, session: ScanSession, wanted: ScanState) -> None:
         try:

@@ -90,10 +90,11 @@ def test_a_killed_service_takes_its_children_along_and_its_scan_can_be_resumed(s
     before = rig.stamps(scan_id)
     assert len(before) >= 2
     rig = service.launch()
-    wait_until_ready(rig.http)
     status = rig.status(scan_id)
     assert status["state"] == "stopped"
     assert status["detail"]
+    rig.assert_held(scan_id, f"the service ended during scan {scan_id}: look at the arm")
+    assert rig.acknowledge().status_code == 200
     assert rig.resume(scan_id).status_code == 200
     rig.wait(scan_id, "done", views=10)
     after = rig.stamps(scan_id)
