@@ -12,7 +12,11 @@ from typing import Protocol
 from canopy_skel.geometry import FloatArray
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
+<<<<<<< HEAD
 from drivers.protocols import Arm, Camera
+=======
+from drivers.protocols import Arm, ArmMode, Camera, ToolPose, raise_unless_movable
+>>>>>>> main
 from drivers.waypoints import after, moves_to
 from service.opened import Opened
 from service.rig import (
@@ -200,6 +204,16 @@ class LocalRig:
     def status(self, scan_id: str) -> ScanStatus:
         """Return the scan as it is."""
         return self._session(scan_id)[1].status
+
+    def pose(self) -> tuple[str, ToolPose] | None:
+        """Return the scan under way and where its flange is; None while there is neither."""
+        for scan_id, (_, session) in [*self._sessions.items()]:
+            if session.status.state is ScanState.RUNNING:
+                try:
+                    return scan_id, self._parts.arm.state().pose
+                except ArmError:
+                    return None
+        return None
 
     def parts(self) -> list[PartStatus]:
         """Return arm, camera, worker and disk."""
