@@ -7,11 +7,7 @@ VALIDATOR := $(VENV)/gltf_validator
 RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
 
-<<<<<<< HEAD
-.PHONY: setup demo demo-scan test check bench bench-scan results departures figures
-=======
-.PHONY: setup demo demo-replay test check bench results departures figures
->>>>>>> main
+.PHONY: setup demo demo-replay test check bench bench-scan results departures figures
 
 setup: $(READY)
 

@@ -12,11 +12,7 @@ from typing import Protocol
 from canopy_skel.geometry import FloatArray
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
-<<<<<<< HEAD
-from drivers.protocols import Arm, Camera
-=======
-from drivers.protocols import Arm, ArmMode, Camera, ToolPose, raise_unless_movable
->>>>>>> main
+from drivers.protocols import Arm, Camera, ToolPose
 from drivers.waypoints import after, moves_to
 from service.opened import Opened
 from service.rig import (
@@ -211,7 +207,7 @@ class LocalRig:
             if session.status.state is ScanState.RUNNING:
                 try:
                     return scan_id, self._parts.arm.state().pose
-                except ArmError:
+                except DriverError:
                     return None
         return None
 
