@@ -17,17 +17,20 @@ from canopy_skel.document import to_json
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
 from canopy_skel.recording.reader import GROUND_TRUTH
+from drivers.guarded_arm import GuardedArm
+from drivers.ur5.arm import Ur5Arm
+from drivers.ur5.messages import Ur5Config
 from mock_hw.fake_ur.process import FakeUr, free_host
 from mock_hw.orchard.path import TOOL_FROM_CAMERA
 from mock_hw.orchard.simulate import Options, prepare
 from mock_hw.sim_camera import SimCamera
 from service.compose import (
+    LIMITS,
     PATHS,
     Hardware,
     ServeOptions,
     composed,
     free_port,
-    guarded,
 )
 from service.replay import ReplayRequest, replay
 from service.server import make_server
@@ -69,6 +72,7 @@ class Rig:
             status = self.status(scan_id)
             if status["state"] in states and status["views_done"] >= views:
                 return status
+            assert status["state"] == "running", status
             assert time.perf_counter() < until, status
             time.sleep(0.05)
 
@@ -181,7 +185,9 @@ def served(data, camera=None, version="3.15"):
     def hardware(options):
         with FakeUr(free_host(), version=version, time_scale=TIME_SCALE) as controller:
             controllers.append(controller)
-            arm = guarded(controller.host)
+            # More patient than the rig's: a busy machine is silent for a moment, too.
+            patient = Ur5Config(host=controller.host, watchdog_hz=1.0, stale_after_s=0.8)
+            arm = GuardedArm(Ur5Arm(patient), LIMITS)
             if camera is not None:
                 yield Hardware(arm, camera, TOOL_FROM_CAMERA, dict)
                 return
