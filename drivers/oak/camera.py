@@ -112,6 +112,8 @@ class OakCamera:
             raise
         if not process.ready:
             raise NoCameraError(str(self._why))
+        if process.owes:
+            raise NoCameraError("the last picture has not come yet: look at cable and light")
 
     def grab(self, timeout_s: float) -> CameraImage:
         """Return a picture no part of which was exposed before this call; see `Camera.grab`.

@@ -16,13 +16,14 @@ class CameraProcess:
     """A child that is running until `close`, or until it is found dead or hanging.
 
     The child speaks only while it opens the device and while it owes a picture, so nothing has to
-    be read in between; but it may say that it ends.
+    be read in between; but it may say that it ends. ready: the device runs. owes: a picture that was
+    asked for has not come yet.
     """
 
     def __init__(self, config: OakConfig, command: Sequence[str]) -> None:
         self.ready = False
         self._config = config
-        self._owes = False
+        self.owes = False
         self._heard_s = time.perf_counter()
         self._child = Child(command)
         self._child.send(config)
@@ -34,8 +35,8 @@ class CameraProcess:
 
     def ask(self, grab: Grab) -> None:
         """Ask for a picture; a picture still owed is forgotten by the child."""
-        if not self._owes:
-            self._owes, self._heard_s = True, time.perf_counter()
+        if not self.owes:
+            self.owes, self._heard_s = True, time.perf_counter()
         self._child.send(grab)
 
     def hear(self, until_s: float) -> Answer | None:
@@ -45,7 +46,7 @@ class CameraProcess:
             NoCameraError: the child has ended or hangs; it must be closed.
         """
         patience_s = self._config.silence_s if self.ready else self._config.open_timeout_s
-        silent_s = self._heard_s + patience_s if self._owes or not self.ready else math.inf
+        silent_s = self._heard_s + patience_s if self.owes or not self.ready else math.inf
         try:
             if not self._child.pipe.poll(max(0.0, min(until_s, silent_s) - time.perf_counter())):
                 if time.perf_counter() < silent_s:
@@ -58,7 +59,7 @@ class CameraProcess:
             raise NoCameraError(answer.text)
         self._heard_s = time.perf_counter()
         self.ready = self.ready or isinstance(answer, Ready)
-        self._owes = self._owes and not isinstance(answer, Picture)
+        self.owes = self.owes and not isinstance(answer, Picture)
         return answer
 
     def kill(self) -> None:
