@@ -16,8 +16,8 @@ class CameraProcess:
     """A child that is running until `close`, or until it is found dead or hanging.
 
     The child speaks only while it opens the device and while it owes a picture, so nothing has to
-    be read in between; but it may say that it ends. ready: the device runs. owes: a picture that was
-    asked for has not come yet.
+    be read in between; but it may say that it ends. ready: the device runs. owes: a picture
+    was asked for and has not come yet.
     """
 
     def __init__(self, config: OakConfig, command: Sequence[str]) -> None:
