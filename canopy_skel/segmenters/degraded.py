@@ -82,6 +82,8 @@ def false_branches(
     found = _painted(view, masks)
     strokes = _confusing_strokes(view, found, rng)
     false: list[BranchMask] = []
+    if not strokes:
+        return false
     for i in rng.choice(len(strokes), len(strokes), replace=False, p=_weights(strokes)):
         stroke = strokes[i]
         luck = rng.normal(0.0, 0.08)
@@ -107,8 +109,10 @@ def _weights(strokes: Sequence[_Stroke]) -> FloatArray:
     kind = np.array([stroke.kind for stroke in strokes])
     weight = np.zeros(len(strokes))
     for name, part in KINDS.items():
-        weight[kind == name] = part * length[kind == name] / max(length[kind == name].sum(), 1e-9)
-    return np.asarray(weight / max(float(weight.sum()), 1e-9))
+        weight[kind == name] = (
+            part * length[kind == name] / max(float(length[kind == name].sum()), 1e-9)
+        )
+    return np.asarray(weight / weight.sum())
 
 
 def _confusing_strokes(view: View, found: BoolArray, rng: np.random.Generator) -> list[_Stroke]:

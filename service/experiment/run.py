@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from itertools import product
+from operator import attrgetter
 from pathlib import Path
 
 import cv2
@@ -76,7 +77,9 @@ def run(
 
 
 def _tasks(experiment: Experiment, store: RowStore) -> Iterator[Task]:
-    for tree in experiment.orchard.trees:
+    """Yield what is lacking, topology by topology: an interrupted run has some of everything."""
+    order = attrgetter("topology", "foliage", "species")
+    for tree in sorted(experiment.orchard.trees, key=order):
         lacking = {
             segmenter: tuple(n for n, key in experiment.keys(tree, segmenter) if key not in store)
             for segmenter in experiment.segmenters
