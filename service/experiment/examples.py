@@ -24,6 +24,7 @@ from service.experiment.run import MEMORY_LIMIT_BYTES
 TOLERANCE_M, SPACING_M = 0.02, 0.008
 BLUE = "#{:02x}{:02x}{:02x}".format(*OBSERVED_RGB)
 GREEN, RED, GREY, BROWN = "#009E73", "#D55E00", "#8A8A8A", "#7A5230"
+COLUMNS = 4
 ORDER = ("mst", "ftsem", "paper")
 
 
@@ -40,8 +41,9 @@ def example(folder: Path, tree: Tree, methods: Sequence[MethodName], segmenter: 
     shown += [name for name in outcomes if name not in ORDER]
     best = outcomes[shown[-1]]
     picture = _picture(views)
-    figure = Figure(figsize=(2.3 * (4 + len(shown)), 3.1), layout="constrained")
-    axes = figure.subplots(1, 4 + len(shown))
+    lines = -(-(4 + len(shown)) // COLUMNS)
+    figure = Figure(figsize=(3.0 * COLUMNS, 3.4 * lines), layout="constrained")
+    axes = figure.subplots(lines, COLUMNS).ravel()
     axes[0].imshow(picture)
     axes[0].set_title(f"{tree.species}, FD{tree.foliage}")
     _draw_truth(axes[1], truth)
@@ -51,15 +53,18 @@ def example(folder: Path, tree: Tree, methods: Sequence[MethodName], segmenter: 
     for ax, name in zip(axes[3:], shown, strict=False):
         figures = _draw_judged(ax, outcomes[name].document, truth)
         ax.set_title(f"{name}: {figures}")
-    _draw_volume(axes[-1], best.document)
-    axes[-1].set_title(f"volume, {shown[-1]}")
+    last = 3 + len(shown)
+    _draw_volume(axes[last], best.document)
+    axes[last].set_title(f"volume, {shown[-1]}")
     low, high = _extent(truth)
-    for ax in axes[1:]:
+    for ax in axes[1 : last + 1]:
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     for ax in axes:
         ax.set(xticks=[], yticks=[])
-        ax.title.set_fontsize(8)
-    return png(figure, dpi=130)
+        ax.title.set_fontsize(9)
+    for ax in axes[last + 1 :]:
+        ax.set_axis_off()
+    return png(figure)
 
 
 def _flat(points: FloatArray) -> FloatArray:

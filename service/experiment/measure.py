@@ -12,6 +12,7 @@ from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.metrics import score
+from canopy_skel.metrics.matching import nearest
 from canopy_skel.pipeline import JOINERS, Extraction, MethodConfig, MethodName, Skeletonizer
 from canopy_skel.recording import Recording, read_recording
 from canopy_skel.segment import BranchMask, Segmenter
@@ -21,6 +22,9 @@ from service.experiment.orchard import Tree
 from service.experiment.rows import Row, Value
 from service.experiment.segmenters import segmenter_named
 from service.skeletons import SOFTWARE
+
+FOUND_M = 0.02
+"""Truth with a vertex of the output this near counts as found wood."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -159,14 +163,17 @@ def figures_of(outcome: Outcome, truth: SkeletonDocument) -> dict[str, Value]:
     document, extraction = outcome.document, outcome.extraction
     scores: dict[str, Value] = dict(score(document, truth).to_dict())
     framed = np.array(truth.extra.get("framed", (True,) * len(truth.position)), dtype=np.bool_)
+    found = np.isfinite(nearest(truth.position, document.position, FOUND_M)[0])
     volume_m3, true_m3 = wood_volume_m3(document), wood_volume_m3(truth, among=framed)
-    observed_m3 = wood_volume_m3(outcome.observed)
+    found_m3 = wood_volume_m3(truth, among=framed & found)
     return {
         **scores,
         "volume_m3": volume_m3,
-        "volume_observed_m3": observed_m3,
+        "volume_observed_m3": wood_volume_m3(outcome.observed),
         "volume_true_m3": true_m3,
+        "volume_found_m3": found_m3,
         "volume_error": (volume_m3 - true_m3) / true_m3 if true_m3 > 0 else None,
+        "volume_found_error": (volume_m3 - found_m3) / found_m3 if found_m3 > 0 else None,
         "instances": outcome.skeletonizer.instances,
         "instances_rejected": len(outcome.skeletonizer.rejected),
         "views_used": len(outcome.skeletonizer.views),

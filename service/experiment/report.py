@@ -26,6 +26,7 @@ EXTENDED = {
     "length_ratio": "length ratio",
     "radius_error_median": "radius error",
     "volume_error": "volume error",
+    "volume_found_error": "of found wood",
     "parent_correct": "parent correct",
     "components": "components",
     "ece": "ECE",

@@ -17,6 +17,7 @@ from service.experiment.orchard import Tree
 
 Value = float | int | bool | str | None
 _SHORT = 12
+_MEASURE = "experiment/measure.py"
 _UNCONCERNED = ("drivers/oak", "drivers/ur5")
 
 
@@ -72,10 +73,15 @@ def key_of(tree: Tree, segmenter: str, method: str, config_sha256: str) -> str:
 def code_sha256() -> str:
     """Return the hash of the version and of all code that rows depend on."""
     digest = sha256(version("canopy-skel").encode())
-    for package in ("canopy_skel", "drivers"):
-        for path, data in sorted(_sources(files(package), package)):
-            if not path.startswith(_UNCONCERNED):
-                digest.update(path.encode() + b"\0" + data + b"\0")
+    sources = [
+        source
+        for package in ("canopy_skel", "drivers")
+        for source in _sources(files(package), package)
+    ]
+    sources.append((_MEASURE, files("service").joinpath(_MEASURE).read_bytes()))
+    for path, data in sorted(sources):
+        if not path.startswith(_UNCONCERNED):
+            digest.update(path.encode() + b"\0" + data + b"\0")
     return digest.hexdigest()
 
 
