@@ -1,7 +1,7 @@
 """Views in, one growing likelihood map, a skeleton out: the whole method in the paper's order."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -17,13 +17,7 @@ from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
-from canopy_skel.likelihood import (
-    LikelihoodConfig,
-    LikelihoodGrid,
-    LikelihoodMap,
-    VoxelIndex,
-    segments_of,
-)
+from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
 from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
 from canopy_skel.segment import Segmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
@@ -31,7 +25,7 @@ from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
 MethodName = Literal["paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
 JOINERS: frozenset[MethodName] = frozenset({"paper", "mst", "ftsem"})
-"""Methods that differ only in how they join the initial skeleton."""
+"""Methods that differ only in how they join the observed skeleton."""
 LONGEST_WAY_M = 5.0
 """Between a camera and the nearest other one of a scan."""
 FARTHEST_M = 1e5
@@ -66,20 +60,12 @@ class MethodConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Extraction:
-    """A skeleton and what its making came across.
-
-    voxels: size of the map. observed: the skeleton before any join. joins: of Algorithm 1.
-    """
+    """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1."""
 
     graph: SkeletonGraph
     voxels: int
-    observed: SkeletonGraph
+    observed_components: int
     joins: tuple[Join, ...]
-
-    @property
-    def observed_components(self) -> int:
-        """How many pieces the observed skeleton is in."""
-        return self.observed.components()[0]
 
 
 class Skeletonizer:
@@ -160,33 +146,26 @@ class Skeletonizer:
                 " must be in metres"
             )
 
-    def skeleton(self) -> Extraction:
-        """Return the skeleton of all views so far; it does not depend on their order."""
-        return self.skeletons((self._config.name,))[self._config.name]
+    def skeleton(self, joined_by: MethodName | None = None) -> Extraction:
+        """Return the skeleton of all views so far; it does not depend on their order.
 
-    def skeletons(self, names: Iterable[MethodName]) -> dict[MethodName, Extraction]:
-        """Return what several methods make of all views so far; all before the joins is shared.
+        Args:
+            joined_by: another method to make the joins by, all before them being the same.
 
         Raises:
-            UsageError: one of them differs from this one in more than the joins.
+            UsageError: that method differs from this one in more than the joins.
         """
-        names = tuple(names)
-        for name in names:
-            if name != self._config.name and not {name, self._config.name} <= JOINERS:
-                raise UsageError(
-                    f"{name} and {self._config.name} differ before the joins: give each its own"
-                    " Skeletonizer"
-                )
+        name = joined_by or self._config.name
+        if name != self._config.name and not {name, self._config.name} <= JOINERS:
+            raise UsageError(
+                f"{name} and {self._config.name} differ before the joins: give each its own"
+                " Skeletonizer"
+            )
         splines = [spline for index in self.views for spline in self._splines[index]]
         with self._stage("initial"):
             grid = self._map.grid()
             index = VoxelIndex(grid.voxels)
             initial = initial_skeleton(segments_of(splines), grid, index, self._config.initial)
-        return {name: self._joined(name, initial, grid, index) for name in names}
-
-    def _joined(
-        self, name: MethodName, initial: SkeletonGraph, grid: LikelihoodGrid, index: VoxelIndex
-    ) -> Extraction:
         joins: list[Join] = []
         with self._stage("join"):
             if name == "mst":
@@ -200,6 +179,6 @@ class Skeletonizer:
         return Extraction(
             graph=graph,
             voxels=len(grid.voxels),
-            observed=initial,
+            observed_components=initial.components()[0],
             joins=tuple(joins),
         )

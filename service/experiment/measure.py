@@ -39,7 +39,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Outcome:
-    """What a method made of a tree, and the skeleton before its joins."""
+    """What a method made of a tree, and the part of it that was not predicted."""
 
     document: SkeletonDocument
     observed: SkeletonDocument
@@ -129,10 +129,11 @@ def outcomes_of(
         )
         for view in views:
             skeletonizer.add_view(view)
-        for name, extraction in skeletonizer.skeletons(names).items():
+        for name in names:
+            extraction = skeletonizer.skeleton(name)
             outcome = Outcome(
                 document=_document(extraction.graph, name, len(views)),
-                observed=_document(extraction.observed, name, len(views)),
+                observed=_document(_observed(extraction.graph), name, len(views)),
                 extraction=extraction,
                 skeletonizer=skeletonizer,
             )
@@ -145,6 +146,21 @@ def _alike(methods: Iterable[MethodName]) -> list[tuple[MethodName, ...]]:
     joiners = tuple(name for name in methods if name in JOINERS)
     others: list[tuple[MethodName, ...]] = [(name,) for name in methods if name not in JOINERS]
     return [joiners, *others] if joiners else others
+
+
+def _observed(graph: SkeletonGraph) -> SkeletonGraph:
+    """Return the part of a skeleton that was not predicted."""
+    kept = np.flatnonzero(~graph.occluded)
+    number = np.full(len(graph.occluded), -1)
+    number[kept] = np.arange(len(kept))
+    edges = number[graph.edges]
+    return SkeletonGraph(
+        vertices_in_base=graph.vertices_in_base[kept],
+        edges=edges[(edges >= 0).all(axis=1)],
+        radius_m=graph.radius_m[kept],
+        occluded=graph.occluded[kept],
+        confidence=graph.confidence[kept],
+    )
 
 
 def _document(graph: SkeletonGraph, name: MethodName, views: int) -> SkeletonDocument:
