@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -69,7 +68,14 @@ def paper_table(
     store = RowStore(output / STORE)
     with progress_bars() as progress:
         rows = run(plan, store, _show(progress, progress.add_task("trees", total=None)))
-    files = _write(output, plan, rows, figures=figures)
+    options = {
+        "methods": methods,
+        "segmenters": segmenters,
+        "species": species,
+        "topologies": topologies,
+        "foliage": foliage,
+    }
+    files = _write(output, _command(orchard, output, options), plan, rows, figures=figures)
     code = _complain(plan.orchard, rows)
     if as_json:
         typer.echo(json.dumps(_summary(plan, rows, files), indent=2))
@@ -79,7 +85,17 @@ def paper_table(
     raise typer.Exit(code)
 
 
-def _write(output: Path, plan: Experiment, rows: list[Row], *, figures: bool) -> list[Path]:
+def _command(orchard: Path, output: Path, options: dict[str, str]) -> str:
+    """Return the command that makes this page, without the places of one machine."""
+    words = ["canopy", "experiment", "paper-table", "--orchard", orchard.name, "-o", output.name]
+    for name, value in options.items():
+        words += [f"--{name}", value] if value else []
+    return shlex.join(words)
+
+
+def _write(
+    output: Path, command: str, plan: Experiment, rows: list[Row], *, figures: bool
+) -> list[Path]:
     pictures: dict[str, tuple[str, bytes]] = {}
     if figures:
         # Imported here: it needs matplotlib, which few installations have.
@@ -87,7 +103,7 @@ def _write(output: Path, plan: Experiment, rows: list[Row], *, figures: bool) ->
 
         pictures = draw_all(plan, rows)
     report = Report(
-        command=shlex.join(["canopy", *sys.argv[1:]]),
+        command=command,
         orchard=plan.orchard,
         methods=plan.methods,
         segmenters=plan.segmenters,

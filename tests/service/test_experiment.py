@@ -21,6 +21,7 @@ from service.experiment.table import Rows, mean_of
 
 LENS = Intrinsics(fx_px=330.0, fy_px=330.0, cx_px=240.0, cy_px=150.0, width_px=480, height_px=300)
 TREES = (("apple", 0, 3), ("oak", 0, 3), ("walnut", 1, 4))
+LEAVES = {"apple": 600, "oak": 2500, "walnut": 300}
 
 
 @pytest.fixture
@@ -47,7 +48,7 @@ def grown(tmp_path_factory):
             Options(
                 species=species,
                 topology=topology,
-                leaf_count=150,
+                leaf_count=LEAVES[species],
                 views=10,
                 rows=False,
                 camera=Camera(intrinsics=LENS),
@@ -56,12 +57,14 @@ def grown(tmp_path_factory):
         path = folder / f"{species}_{topology:03d}_fd{foliage}.mcap"
         with RecordingWriter(path, {"scan_id": scan.scan_id}) as writer:
             for view in views(scan):
-                if view.index % 4 == 1:
+                if view.index % 5 == 1:
                     writer.write_view(view)
             data = to_json(truth(scan))
             writer.attach("ground_truth_skeleton.json", "application/json", data)
         digest = sha256(path.read_bytes()).hexdigest()
-        entries.append({"file": path.name, "sha256": digest, "leaf_count": 150, "v_det": 0.5})
+        entries.append(
+            {"file": path.name, "sha256": digest, "leaf_count": LEAVES[species], "v_det": 0.5}
+        )
     (folder / "manifest.json").write_text(json.dumps({"recordings": entries[:2]}))
     return folder
 
