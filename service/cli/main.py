@@ -5,6 +5,7 @@ import sys
 import typer
 
 from canopy_skel.errors import CanopyError, UsageError
+from service.cli.coco import coco
 from service.cli.doctor import doctor
 from service.cli.experiment import experiment
 from service.cli.export import export
@@ -15,6 +16,7 @@ from service.cli.scan import scan
 from service.cli.score import score
 from service.cli.serve import serve, worker
 from service.cli.shell import Exit, complain
+from service.cli.simulate import simulate
 
 app = typer.Typer(
     name="canopy",
@@ -23,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for verb in (replay, inspect, score, recover, export, serve, scan, doctor):
+for verb in (replay, inspect, score, recover, export, serve, scan, simulate, coco, doctor):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)
 app.add_typer(experiment)

@@ -19,6 +19,9 @@ def serve(
     data: Annotated[Path, typer.Option(help="Folder of recordings and catalogue.")] = Path("data"),
     site: Annotated[str, typer.Option(help="Name of the site on the bus.")] = "orchard",
     rig: Annotated[str, typer.Option(help="Name of the rig on the bus.")] = "rig-1",
+    bus: Annotated[
+        str | None, typer.Option(help="Where the bus listens, for others on this machine.")
+    ] = None,
     species: Annotated[str, typer.Option(help="Simulated tree: apple, oak, walnut.")] = "apple",
     topology: Annotated[int, typer.Option(help="Which tree of the species.")] = 0,
     leaves: Annotated[int, typer.Option(help="How many leaves it bears.")] = 500,
@@ -42,6 +45,7 @@ def serve(
         orchard=Options(species=species, topology=topology, leaf_count=leaves, weather="fair"),
         time_scale=time_scale,
         picture_scale=picture_scale,
+        bus=bus,
     )
     with composed(options) as service:
         make_server(service, host=host, port=port).run()
