@@ -32,7 +32,7 @@ def example(folder: Path, tree: Tree, methods: Sequence[MethodName], segmenter: 
     """Draw one tree, side by side, seen from the robot.
 
     Raises:
-        RecordingError: the recording cannot be read, or carries no truth.
+        CanopyError: the recording cannot be used, or carries no truth.
     """
     recording, views = read_views(folder / tree.file)
     truth = truth_of(recording)

@@ -121,23 +121,39 @@ def outcomes_of(
     methods: Iterable[MethodName],
     memory_limit_bytes: int,
 ) -> Iterator[tuple[MethodName, Outcome]]:
-    """Yield what each method makes of the views; they share all that they have in common."""
+    """Yield what each method makes of the views; they share all that they have in common.
+
+    Views that cannot be used are left out; rows say how many were.
+
+    Raises:
+        ViewError: none can be used.
+    """
     masks = _Once(segmenter)
     for names in _alike(methods):
-        skeletonizer = Skeletonizer(
-            masks, MethodConfig(name=names[0]), memory_limit_bytes=memory_limit_bytes
-        )
-        for view in views:
-            skeletonizer.add_view(view)
+        front = MethodConfig(name="paper" if len(names) > 1 else names[0])
+        skeletonizer = Skeletonizer(masks, front, memory_limit_bytes=memory_limit_bytes)
+        _add_all(skeletonizer, views)
+        used = len(skeletonizer.views)
         for name in names:
             extraction = skeletonizer.skeleton(name)
             outcome = Outcome(
-                document=_document(extraction.graph, name, len(views)),
-                observed=_document(_observed(extraction.graph), name, len(views)),
+                document=_document(extraction.graph, name, used),
+                observed=_document(_observed(extraction.graph), name, used),
                 extraction=extraction,
                 skeletonizer=skeletonizer,
             )
             yield name, outcome
+
+
+def _add_all(skeletonizer: Skeletonizer, views: Sequence[View]) -> None:
+    reasons = []
+    for view in views:
+        try:
+            skeletonizer.add_view(view)
+        except ViewError as error:
+            reasons.append(str(error))
+    if not skeletonizer.views:
+        raise ViewError(f"no view is usable; the first: {reasons[0] if reasons else 'none'}")
 
 
 def _alike(methods: Iterable[MethodName]) -> list[tuple[MethodName, ...]]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from canopy_skel.errors import RecordingError
+from canopy_skel.errors import CanopyError
 from service.experiment.examples import example
 from service.experiment.figures import over_degradation, over_foliage
 from service.experiment.report import degradations
@@ -36,7 +36,7 @@ def draw_all(plan: Experiment, rows: Sequence[Row]) -> dict[str, tuple[str, byte
         tree = min(trees, key=lambda tree: (abs(tree.foliage - EXAMPLE_FOLIAGE), tree.topology))
         try:
             data = example(plan.folder, tree, plan.methods, segmenter_named(first))
-        except RecordingError:
+        except CanopyError:
             continue  # Its rows say so already.
         title = f"{tree.name}: blue right and observed, green right and predicted, red wrong"
         pictures[f"example_{species}.png"] = (title, data)
