@@ -25,6 +25,8 @@ from canopy_skel.strands import StrandMap
 
 MethodName = Literal["paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
+JOINERS: frozenset[MethodName] = frozenset({"paper", "mst", "ftsem"})
+"""Methods that differ only in how they join the observed skeleton."""
 LONGEST_WAY_M = 5.0
 """Between a camera and the nearest other one of a scan."""
 FARTHEST_M = 1e5
@@ -106,6 +108,7 @@ class Skeletonizer:
         self._strands = StrandMap(config.likelihood.voxel_size_m, config.initial.smoothing)
         self._search = PathSearch(self._map)
         self._initial: SkeletonGraph | None = None
+        self._searched: SkeletonGraph | None = None
 
     @property
     def config(self) -> MethodConfig:
@@ -192,18 +195,32 @@ class Skeletonizer:
                 " must be in metres"
             )
 
-    def skeleton(self) -> Extraction:
-        """Return the skeleton of all views so far; it does not depend on their order."""
+    def skeleton(self, joined_by: MethodName | None = None) -> Extraction:
+        """Return the skeleton of all views so far; it does not depend on their order.
+
+        Args:
+            joined_by: another method to make the joins by, all before them being the same.
+
+        Raises:
+            UsageError: that method differs from this one in more than the joins.
+        """
+        name = joined_by or self._config.name
+        if name != self._config.name and not {name, self._config.name} <= JOINERS:
+            raise UsageError(
+                f"{name} and {self._config.name} differ before the joins: give each its own"
+                " Skeletonizer"
+            )
         initial = self._observed()
         joins: list[Join] = []
+        search = self._repaired(initial) if name == "paper" else None
         with self._stage("join"):
-            if self._config.name == "mst":
-                graph = join_by_spanning_tree(initial, self._map.voxel_size_m)
-            elif self._config.name == "ftsem":
-                graph = join_break_points(initial, self._map.voxel_size_m, self._config.ftsem)
-            else:
-                joins = self._search.joins()
+            if search is not None:
+                joins = search.joins()
                 graph = self._joined(initial, joins)
+            elif name == "mst":
+                graph = join_by_spanning_tree(initial, self._map.voxel_size_m)
+            else:
+                graph = join_break_points(initial, self._map.voxel_size_m, self._config.ftsem)
         return self._extraction(initial, graph, joins, preview=False)
 
     def preview(self) -> Extraction:
@@ -214,22 +231,27 @@ class Skeletonizer:
         if self._config.name != "paper":
             return self.skeleton()
         initial = self._observed()
+        search = self._repaired(initial)
         with self._stage("preview"):
-            joins = self._search.preview()
+            joins = search.preview()
             graph = self._joined(initial, joins)
         return self._extraction(initial, graph, joins, preview=True)
 
     def _observed(self) -> SkeletonGraph:
-        """Return G_init, with the search repaired where views have changed it or the map."""
+        """Return G_init."""
         if self._initial is None:
             with self._stage("initial"):
                 strands = self._strands.smoothed()
-                initial = initial_skeleton(strands, self._map, self._config.initial)
-            if self._config.name == "paper":
-                with self._stage("repair"):
-                    self._search.update(initial)
-            self._initial = initial
+                self._initial = initial_skeleton(strands, self._map, self._config.initial)
         return self._initial
+
+    def _repaired(self, initial: SkeletonGraph) -> PathSearch:
+        """Return the search, repaired where views have changed G_init or the map."""
+        if self._searched is not initial:
+            with self._stage("repair"):
+                self._search.update(initial)
+            self._searched = initial
+        return self._search
 
     def _joined(self, initial: SkeletonGraph, joins: list[Join]) -> SkeletonGraph:
         graph = add_paths(initial, joins, self._map)

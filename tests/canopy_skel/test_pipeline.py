@@ -221,3 +221,17 @@ def test_the_configuration_hash_names_the_settings():
     assert MethodConfig().sha256() == MethodConfig().sha256()
     other = MethodConfig(likelihood=LikelihoodConfig(voxel_size_m=0.01))
     assert MethodConfig().sha256() != other.sha256()
+
+
+def test_methods_that_share_their_front_end_are_as_each_alone(views):
+    shared = skeletonizer()
+    for view in views:
+        shared.add_view(view)
+    for name in METHODS:
+        alone = skeletonizer(name)
+        for view in views:
+            alone.add_view(view)
+        graph, other = alone.skeleton().graph, shared.skeleton(joined_by=name).graph
+        np.testing.assert_array_equal(graph.vertices_in_base, other.vertices_in_base)
+        np.testing.assert_array_equal(graph.edges, other.edges)
+        np.testing.assert_array_equal(graph.confidence, other.confidence)
