@@ -94,7 +94,7 @@ def test_a_worker_killed_at_view_k_is_caught_up_by_the_next(rig, views, k):
         first.kill()
         wait_for(lambda: not rig.feeder.worker_status().ready, 1)
         record(rig, writer, views[k:])
-        rig.start_worker()
+        rig.start_ready_worker()
         assert rig.feeder.flush(20)  # from the file that is still being written
     finish(rig)
 
@@ -106,7 +106,7 @@ def test_a_worker_killed_again_and_again_ends_with_the_same_bytes(rig, views):
             record(rig, writer, views[k : k + 4])
             worker.kill()
             wait_for(lambda: not rig.feeder.worker_status().ready, 1)
-    rig.start_worker()
+    rig.start_ready_worker()
     finish(rig)
 
 
@@ -118,7 +118,7 @@ def test_a_worker_that_starts_after_the_scan_gets_all_of_it(rig, views):
     assert "no worker has reported yet" in status.detail
     assert not rig.feeder.flush(0.2)
     assert list(rig.session.get(rig.keys.skeleton(rig.scan_id), timeout=1)) == []
-    rig.start_worker()
+    rig.start_ready_worker()
     finish(rig)
 
 
