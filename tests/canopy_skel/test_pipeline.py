@@ -6,7 +6,7 @@ from canopy_skel.document import Method, build_document, to_json
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.likelihood import LikelihoodConfig
-from canopy_skel.pipeline import METHODS, MethodConfig, Skeletonizer
+from canopy_skel.pipeline import JOINERS, METHODS, MethodConfig, Skeletonizer
 from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from drivers.stereo import with_depth
@@ -223,11 +223,12 @@ def test_the_configuration_hash_names_the_settings():
     assert MethodConfig().sha256() != other.sha256()
 
 
-def test_methods_that_share_their_front_end_are_as_each_alone(views):
-    shared = skeletonizer()
+@pytest.mark.parametrize("first", sorted(JOINERS))
+def test_methods_that_share_their_front_end_are_as_each_alone(views, first):
+    shared = skeletonizer(first)
     for view in views:
         shared.add_view(view)
-    for name in METHODS:
+    for name in (first, *sorted(JOINERS)):
         alone = skeletonizer(name)
         for view in views:
             alone.add_view(view)
