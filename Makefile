@@ -7,7 +7,7 @@ VALIDATOR := $(VENV)/gltf_validator
 RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
 
-.PHONY: setup demo demo-scan test check bench results departures figures
+.PHONY: setup demo demo-replay test check bench results departures figures
 
 setup: $(READY)
 
@@ -24,14 +24,15 @@ $(READY): $(RUNS) tests/gltf_validator/package-lock.json
 		ci --prefix $(VALIDATOR) --no-audit --no-fund --loglevel=error
 	touch $@
 
+# A whole scan, everything simulated: HTTP, the real arm client, bus, worker; about a minute.
 demo: $(RUNS)
+	$(BIN)/python -m service.demo out
+
+# A recording of such a scan, replayed.
+demo-replay: $(RUNS)
 	$(BIN)/canopy replay recordings/demo_apple.mcap -o out --method paper --segmenter recorded
 	@echo "The skeleton: out/demo_apple.skeleton.json, and for viewers out/demo_apple.skeleton.glb"
 	@echo "Its picture:  out/demo_apple.overlay.png"
-
-# A whole scan, everything simulated: HTTP, the real arm client, bus, worker; about a minute.
-demo-scan: $(RUNS)
-	$(BIN)/python -m service.demo out
 
 test: $(READY)
 	$(BIN)/python -m pytest

@@ -300,6 +300,16 @@ def encode_transforms(transforms: Iterable[StampedTransform]) -> bytes:
     return _serialize(message)
 
 
+def encode_pose(pose: StampedTransform) -> bytes:
+    """Return a foxglove.PoseInFrame: where `child` is in `parent`."""
+    message = PoseInFrame(frame_id=pose.parent)
+    message.timestamp.FromNanoseconds(pose.stamp_ns)
+    position, orientation = message.pose.position, message.pose.orientation
+    position.x, position.y, position.z = pose.translation_m
+    orientation.x, orientation.y, orientation.z, orientation.w = pose.quaternion_xyzw
+    return _serialize(message)
+
+
 def _parse(message_class: type[_P], data: bytes) -> _P:
     try:
         return message_class.FromString(data)

@@ -7,10 +7,13 @@ from importlib.metadata import version
 
 from fastapi import APIRouter, FastAPI
 from fastapi.responses import HTMLResponse
+from fastapi.staticfiles import StaticFiles
 from numpy.typing import ArrayLike
 
 from service.bell import Bell
 from service.catalogue import Catalogue
+from service.http import metrics as metric_routes
+from service.http import planners as planner_routes
 from service.http import rig as rig_routes
 from service.http import scans as scan_routes
 from service.http import skeletons as skeleton_routes
@@ -62,8 +65,10 @@ def create_app(
         caps=caps or SpeedCaps(),
     )
     add_handlers(app)
-    for router in (_page, rig_routes.router, scan_routes.router, skeleton_routes.router):
+    routes = (rig_routes, metric_routes, scan_routes, planner_routes, skeleton_routes)
+    for router in (_page, *(module.router for module in routes)):
         app.include_router(router)
+    app.mount("/console", StaticFiles(packages=[("service", "console")]))
     return app
 
 

@@ -215,6 +215,19 @@ class Catalogue:
         with self.transaction() as connection:
             return [_scan_record(row) for row in connection.execute(query.limit(limit))]
 
+    def count_scans(self) -> dict[str, int]:
+        """Return how many scans are in each state."""
+        return self._counts(SCANS.c.state)
+
+    def count_events(self) -> dict[str, int]:
+        """Return how many events of each kind there were."""
+        return self._counts(EVENTS.c.kind)
+
+    def _counts(self, column: sa.Column[str]) -> dict[str, int]:
+        with self.transaction() as connection:
+            rows = connection.execute(sa.select(column, sa.func.count()).group_by(column))
+            return {str(row[0]): int(row[1]) for row in rows}
+
     def unfinished(self) -> list[ScanRecord]:
         """Return the scans that can still go on, newest first."""
         query = sa.select(SCANS).where(SCANS.c.state.not_in(FINISHED))

@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import zenoh
 from fastapi import FastAPI
 
 from canopy_skel.document import to_json
@@ -24,6 +23,7 @@ from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
 from mock_hw.orchard.simulate import Options, prepare
 from mock_hw.sim_camera import SimCamera
 from service.app import create_app
+from service.broadcast import Broadcast
 from service.bus import Keys, open_session
 from service.catalogue import Catalogue
 from service.feeder import ScanSource, ViewFeeder
@@ -50,6 +50,7 @@ class ServeOptions:
 
     robot: host of the controller; None = simulation, of which `orchard` says what stands there,
     `time_scale` how much faster than real the arm moves and `picture_scale` the size of pictures.
+    bus: where the bus listens, such as "tcp/127.0.0.1:7447"; None = on a free port.
     """
 
     data: Path
@@ -59,6 +60,7 @@ class ServeOptions:
     orchard: Options
     time_scale: float
     picture_scale: float
+    bus: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +120,11 @@ def composed(
     chosen = hardware_of or (simulated if options.robot is None else _real)
     with ExitStack() as stack:
         hardware = stack.enter_context(chosen(options))
-        feeder = stack.enter_context(_worker(options, lambda *news: announce(*news)))
+        endpoint = options.bus or f"tcp/127.0.0.1:{free_port()}"
+        session = stack.enter_context(open_session(listen=endpoint))
+        stack.enter_context(Supervised("worker", worker_command(options, endpoint)))
+        keys = Keys(site=options.site, rig=options.rig)
+        feeder = stack.enter_context(ViewFeeder(session, keys, lambda *news: announce(*news)))
         rig = LocalRig(
             RigParts(
                 arm=hardware.arm,
@@ -135,6 +141,7 @@ def composed(
             rig.announce(scan_id, "skeleton", {"bytes": len(document)})
 
         stack.enter_context(rig)
+        rig.subscribe(stack.enter_context(Broadcast(session, keys, rig.pose)).event)
         catalogue = stack.enter_context(Catalogue(options.data))
         yield create_app(rig, catalogue, PATHS)
 
@@ -164,19 +171,10 @@ def _real(options: ServeOptions) -> Iterator[Hardware]:
     yield Hardware(guarded(options.robot or ""), OakCamera(), TOOL_FROM_CAMERA, dict)
 
 
-@contextmanager
-def _worker(
-    options: ServeOptions, on_skeleton: Callable[[str, bytes], None]
-) -> Iterator[ViewFeeder]:
-    """Listen on the bus and keep a worker running that connects to it."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+def worker_command(options: ServeOptions, endpoint: str) -> list[str]:
+    """Return the command of a worker that connects to `endpoint` and ends with this process."""
     command = [sys.executable, "-m", "service.worker", "--connect", endpoint]
-    command += ["--site", options.site, "--rig", options.rig, "--parent", str(os.getpid())]
-    keys = Keys(site=options.site, rig=options.rig)
-    with ExitStack() as stack:
-        session: zenoh.Session = stack.enter_context(open_session(listen=endpoint))
-        stack.enter_context(Supervised("worker", command))
-        yield stack.enter_context(ViewFeeder(session, keys, on_skeleton))
+    return [*command, "--site", options.site, "--rig", options.rig, "--parent", str(os.getpid())]
 
 
 def free_port() -> int:

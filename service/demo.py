@@ -14,6 +14,7 @@ from urllib.request import urlopen
 from service.compose import free_port
 
 CANOPY = Path(sys.executable).with_name("canopy")
+DEMO = "demo"
 READY_WITHIN_S = 120.0
 
 
@@ -34,18 +35,28 @@ def main() -> None:
         finally:
             service.terminate()
             service.wait()
-    recording, skeleton = scanned["files"]
-    _run("replay", recording, "-o", out)
-    scores = json.loads(_run("score", skeleton, recording, "--json"))
+    recording, live = (_named(Path(file), out) for file in scanned["files"])
+    _run("replay", recording, "-o", out / "replayed")
+    replayed = out / "replayed" / live.name
+    if replayed.read_bytes() != live.read_bytes():
+        sys.exit(f"{live} and {replayed} differ: the live skeleton is not that of its recording")
+    _say("The skeleton that grew during the scan has the bytes that a replay of it gives")
+    for name in ("skeleton.glb", "overlay.png"):
+        (out / "replayed" / f"{DEMO}.{name}").replace(out / f"{DEMO}.{name}")
+    scores = json.loads(_run("score", live, recording, "--json"))
     _say(
         f"Against the simulated truth: precision {scores['precision']:.3f},"
         f" recall {scores['recall']:.3f} of the tree, {scores['recall_masked']:.3f} of what the"
         " masks show (a simulation: no orchard was measured)"
     )
-    stem = Path(recording).stem
     _say(f"The recording: {recording}")
-    _say(f"The skeleton:  {skeleton}, and for viewers {out / stem}.skeleton.glb")
-    _say(f"Its picture:   {out / stem}.overlay.png")
+    _say(f"The skeleton:  {live}, and for viewers {out / DEMO}.skeleton.glb")
+    _say(f"Its picture:   {out / DEMO}.overlay.png")
+
+
+def _named(file: Path, out: Path) -> Path:
+    """Give a result the demo's name instead of its scan's."""
+    return file.replace(out / (DEMO + "".join(file.suffixes)))
 
 
 def _wait_until_ready(url: str, service: subprocess.Popen[bytes]) -> None:

@@ -12,7 +12,7 @@ from typing import Protocol
 from canopy_skel.geometry import FloatArray
 from drivers.errors import ArmError, ArmStoppedError, CameraError, DriverError, MoveRefusedError
 from drivers.guarded_arm import Limits
-from drivers.protocols import Arm, ArmMode, Camera, raise_unless_movable
+from drivers.protocols import Arm, ArmMode, Camera, ToolPose, raise_unless_movable
 from drivers.waypoints import after, moves_to
 from service.rig import (
     FINISHED,
@@ -184,6 +184,16 @@ class LocalRig:
     def status(self, scan_id: str) -> ScanStatus:
         """Return the scan as it is."""
         return self._session(scan_id)[1].status
+
+    def pose(self) -> tuple[str, ToolPose] | None:
+        """Return the scan under way and where its flange is; None while there is neither."""
+        for scan_id, (_, session) in [*self._sessions.items()]:
+            if session.status.state is ScanState.RUNNING:
+                try:
+                    return scan_id, self._parts.arm.state().pose
+                except ArmError:
+                    return None
+        return None
 
     def parts(self) -> list[PartStatus]:
         """Return arm, camera, worker and disk."""

@@ -42,6 +42,15 @@ class Pictures:
         Raises:
             NoPictureError: it is not there.
         """
+        try:
+            return self._picture(path, index, kind)
+        except NoPictureError:
+            # A recording gets its final name when it is whole, perhaps just now.
+            if path is None or not path.name.endswith(".part") or path.exists():
+                raise
+            return self._picture(path, index, kind)
+
+    def _picture(self, path: Path | None, index: int, kind: PictureKind) -> bytes:
         recording = self._open(path)
         role = "depth_image" if kind is PictureKind.DEPTH_PNG else _color_role(recording, index)
         ref = next((g.refs.get(role) for g in recording.groups if g.index == index), None)
@@ -52,7 +61,7 @@ class Pictures:
             )
         try:
             return _encoded(recording, ref, kind)
-        except (RecordingError, ValueError) as error:
+        except (RecordingError, OSError, ValueError) as error:
             raise NoPictureError(f"view {index}: {error}") from error
 
     def _open(self, path: Path | None) -> Recording:

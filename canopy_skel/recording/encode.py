@@ -98,15 +98,16 @@ def _transforms(view: View, tool_from_camera: FloatArray) -> bytes:
     base_from_tool = view.base_from_camera @ invert(tool_from_camera)
     return encode_transforms(
         (
-            _transform(view.stamp_ns, TOOL_FRAME, CAMERA_FRAME, tool_from_camera),
-            _transform(view.stamp_ns, BASE_FRAME, TOOL_FRAME, base_from_tool),
+            stamped_transform(view.stamp_ns, TOOL_FRAME, CAMERA_FRAME, tool_from_camera),
+            stamped_transform(view.stamp_ns, BASE_FRAME, TOOL_FRAME, base_from_tool),
         )
     )
 
 
-def _transform(
+def stamped_transform(
     stamp_ns: int, parent: str, child: str, parent_from_child: FloatArray
 ) -> StampedTransform:
+    """Return the pose of frame `child` in frame `parent`, which the (4, 4) matrix is."""
     x, y, z, w = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat(canonical=True)
     return StampedTransform(
         stamp_ns=stamp_ns,

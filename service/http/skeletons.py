@@ -116,7 +116,7 @@ async def _newest(
             break
         await wait_for_ring(ring, left_s)
     if rendered is None:
-        raise await run_in_threadpool(_pending, here, scan_id)
+        raise await run_in_threadpool(no_skeleton_yet, here, scan_id)
     return _respond(rendered, if_none_match, headers)
 
 
@@ -158,7 +158,8 @@ def _respond(rendered: Rendered, if_none_match: str, more: dict[str, str]) -> Re
     return Response(rendered.content, media_type=rendered.media_type, headers=headers)
 
 
-def _pending(here: Context, scan_id: str) -> Problem:
+def no_skeleton_yet(here: Context, scan_id: str) -> Problem:
+    """Return the answer while a scan has no skeleton; it says so if no worker is there."""
     status = here.scans.status(scan_id)
     worker = [p for p in here.rig.parts() if p.name == "worker" and not p.ready]
     reason = f"; no worker: {worker[0].detail}" if worker else ""

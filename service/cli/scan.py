@@ -1,0 +1,57 @@
+"""`canopy scan`."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from canopy_skel.pipeline import METHODS
+from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
+from service.outputs import require_writable, write_all
+
+
+def scan(
+    output: Out,
+    tree: Annotated[str, typer.Option(help="Which tree this is.")] = "tree",
+    path: Annotated[str, typer.Option(help="Named path of waypoints.")] = "orchard-10",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
+    url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
+    as_json: AsJson = False,
+) -> None:
+    """Start a scan over HTTP, show how it goes, and fetch its recording and skeleton."""
+    # Imported here: only this command talks HTTP.
+    from service.scan_client import ScanEvent, fetch
+    from service.scan_client import scan as run_scan
+
+    require_writable(output)
+    with progress_bars() as progress:
+        task = progress.add_task(tree, total=None)
+
+        def show(event: ScanEvent) -> None:
+            status = event.status
+            progress.update(task, completed=status.views_done, total=status.views_total)
+            if event.kind in ("retake", "stopped", "failed"):
+                stderr.print(f"{event.kind}: {status.detail or dict(event.fields)}", markup=False)
+
+        body = {"tree_id": tree, "path": path, "method": method, "voxel_size_m": voxel}
+        result = run_scan(url, body, show)
+    status = result.status
+    contents = {f"{status.scan_id}.mcap": fetch(url, f"/v1/scans/{status.scan_id}/recording.mcap")}
+    if result.skeleton is not None:
+        contents[f"{status.scan_id}.skeleton.json"] = result.skeleton
+    files = [str(file) for file in write_all(output, contents)]
+    if as_json:
+        typer.echo(json.dumps({"scan_id": status.scan_id, "state": status.state, "files": files}))
+    else:
+        typer.echo(
+            f"scan {status.scan_id} is {status.state}: {status.views_done} of"
+            f" {status.views_total} views" + (f"; {status.detail}" if status.detail else "")
+        )
+        for file in files:
+            typer.echo(f"  {file}")
+    if status.state != "done":
+        raise typer.Exit(Exit.FAILED)
+    if not result.complete:
+        stderr.print("warning: the worker has not finished the skeleton of all views")
+        raise typer.Exit(Exit.PARTIAL)

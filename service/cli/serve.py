@@ -1,0 +1,59 @@
+"""`canopy serve` and `canopy worker`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from canopy_skel.errors import UsageError
+from service.outputs import require_writable
+
+
+def serve(
+    sim: Annotated[
+        bool, typer.Option("--sim", help="A simulated arm before a grown tree.")
+    ] = False,
+    robot: Annotated[str | None, typer.Option(help="Address of the UR controller.")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.")] = 8000,
+    data: Annotated[Path, typer.Option(help="Folder of recordings and catalogue.")] = Path("data"),
+    site: Annotated[str, typer.Option(help="Name of the site on the bus.")] = "orchard",
+    rig: Annotated[str, typer.Option(help="Name of the rig on the bus.")] = "rig-1",
+    bus: Annotated[
+        str | None, typer.Option(help="Where the bus listens, for others on this machine.")
+    ] = None,
+    species: Annotated[str, typer.Option(help="Simulated tree: apple, oak, walnut.")] = "apple",
+    topology: Annotated[int, typer.Option(help="Which tree of the species.")] = 0,
+    leaves: Annotated[int, typer.Option(help="How many leaves it bears.")] = 500,
+    time_scale: Annotated[float, typer.Option(help="Simulated arm: times real speed.")] = 1.0,
+    picture_scale: Annotated[float, typer.Option(help="Size of simulated pictures.")] = 1.0,
+) -> None:
+    """Run the scan service: the rig over HTTP, with a worker that makes skeletons."""
+    # Only this command needs hardware, simulation and web, which take long to load.
+    from mock_hw.orchard.simulate import Options
+    from service.compose import ServeOptions, composed
+    from service.server import make_server
+
+    if sim == (robot is not None):
+        raise UsageError("give either --sim or --robot HOST")
+    require_writable(data)
+    options = ServeOptions(
+        data=data,
+        robot=robot,
+        site=site,
+        rig=rig,
+        orchard=Options(species=species, topology=topology, leaf_count=leaves, weather="fair"),
+        time_scale=time_scale,
+        picture_scale=picture_scale,
+        bus=bus,
+    )
+    with composed(options) as service:
+        make_server(service, host=host, port=port).run()
+
+
+def worker(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+    """Run a skeleton worker by itself: --connect ENDPOINT --site SITE --rig RIG [--id ID]."""
+    # Imported here: only workers need the bus.
+    from service.worker import main as run_worker
+
+    run_worker(arguments or [])

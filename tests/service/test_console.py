@@ -1,0 +1,73 @@
+"""The operator's page in a real browser."""
+
+import shutil
+
+import pytest
+from live_service import serving, skeleton, wait_until
+from playwright.sync_api import expect, sync_playwright
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking"]
+INK = """canvas => {
+    const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    return data.reduce((count, value, i) => count + (i % 4 === 3 && value > 0), 0);
+}"""
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's package chromium")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser):
+    page = browser.new_page()
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    yield page
+    page.close()
+    assert problems == []
+
+
+def test_an_operator_starts_a_scan_watches_the_skeleton_grow_and_stops_the_arm(page, tmp_path):
+    with serving(tmp_path) as live:
+        page.goto(live.url)
+        expect(page.get_by_role("status")).to_have_text("ready")
+        page.get_by_label("Tree").fill("row3-tree12")
+        page.get_by_role("button", name="Start").click()
+        expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
+        scan_id = live.rig.specs[0].scan_id
+        live.rig.photograph(scan_id, 1)  # the recording behind it begins with view 1
+        expect(page.get_by_alt_text("newest view")).to_be_visible()
+        assert page.locator("#tree").evaluate(INK) == 0
+        live.rig.publish(scan_id, skeleton(scan_id, 1))
+        expect(page.locator("#legend")).to_contain_text("1.0 m in 1 branches")
+        assert page.locator("#tree").evaluate(INK) > 100
+        live.rig.publish(scan_id, skeleton(scan_id, 2, length_m=2.0))
+        expect(page.locator("#legend")).to_contain_text("Skeleton of 2 views: 2.0 m")
+        page.get_by_role("button", name="STOP").click()
+        wait_until(lambda: live.rig.stops == 1)
+
+
+def test_a_stop_is_shown_and_acknowledged_with_a_reason(page, tmp_path):
+    page.on("dialog", lambda dialog: dialog.accept("way is clear"))
+    with serving(tmp_path) as live:
+        live.rig.broken_parts["arm"] = "protective stop; mend it, then acknowledge"
+        page.goto(live.url)
+        expect(page.get_by_role("status")).to_contain_text("arm: protective stop; mend it")
+        page.get_by_role("button", name="Acknowledge").click()
+        wait_until(lambda: live.rig.acknowledged == ["way is clear"])
+
+
+def test_a_refused_start_says_why(page, tmp_path):
+    with serving(tmp_path) as live:
+        live.start()
+        page.goto(live.url)
+        page.get_by_label("Tree").fill("another")
+        page.get_by_role("button", name="Start").click()
+        expect(page.get_by_role("alert")).to_contain_text("is under way; wait or cancel it")
