@@ -8,7 +8,18 @@ from canopy_skel.pipeline import Extraction, Skeletonizer
 from canopy_skel.segment import Segmenter
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
-SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"recorded": RecordedSegmenter}
+
+
+def _unet() -> Segmenter:
+    """Return the learned segmenter with the built-in weights."""
+    # Imported here: torch takes seconds to load, and only this segmenter needs it.
+    from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+    from canopy_skel.segmenters.unet.weights import load
+
+    return UNetSegmenter(load())
+
+
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"recorded": RecordedSegmenter, "unet": _unet}
 SOFTWARE = f"canopy-skel {version('canopy-skel')}"
 
 

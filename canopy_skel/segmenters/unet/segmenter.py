@@ -1,7 +1,7 @@
 """The learned segmenter: a view in, scored branch instances out."""
 
+import copy
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from canopy_skel.segmenters.unet.grouping import Strands, grouped
 from canopy_skel.segmenters.unet.network import MULTIPLE_PX, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.targets import STRIDE
-from canopy_skel.segmenters.unet.weights import BUILTIN, fused, load
+from canopy_skel.segmenters.unet.weights import Model, fused
 
 TILE_PX = 1536
 _OVERLAP_PX = 192
@@ -30,28 +30,28 @@ class UNetSegmenter:
 
     def __init__(
         self,
-        weights: Path = BUILTIN,
+        model: Model,
         *,
         bfloat16: bool = False,
         threads: int = 1,
         device: str = "cpu",
         tile_px: int = TILE_PX,
     ) -> None:
-        """Load weights.
+        """Make a model ready to run; see `weights.load`.
 
         bfloat16: half the time, results that differ a little from float32; for CPUs that have it.
         threads: of torch in this process; one leaves the other cores to arm, bus and mapping.
 
         Raises:
-            UsageError: the weights are unusable, or this machine lacks bfloat16 or the device.
+            UsageError: this machine lacks bfloat16 or the device.
         """
         if bfloat16 and device == "cpu" and not has_fast_bfloat16():
             raise UsageError("this CPU has no bfloat16 arithmetic; leave bfloat16 off")
         if device.startswith("cuda") and not torch.cuda.is_available():
             raise UsageError(f"torch finds no device {device!r}; install its CUDA build or use cpu")
         torch.set_num_threads(threads)
-        self._model = load(weights)
-        network = fused(self._model.network)
+        self._model = model
+        network = fused(copy.deepcopy(model.network).eval())
         self._network = network.to(device, memory_format=torch.channels_last)
         self._device, self._bfloat16, self._tile_px = device, bfloat16, tile_px
 
