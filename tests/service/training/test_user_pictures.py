@@ -102,7 +102,7 @@ def test_a_polygon_is_the_pixels_inside_it(folder):
     (upright, across) = image.lines
     assert upright[:, 0] == pytest.approx(24.5)
     assert sorted(upright[[0, -1], 1]) == pytest.approx([10, 99])
-    assert across[:, 2] == pytest.approx(3.0, rel=0.05)
+    assert across[:, 2] == pytest.approx(3.0, rel=0.1)
     assert not image.ignore.any()
     assert image.color_rgb.shape == (*SIZE, 3)
 
@@ -383,5 +383,6 @@ def test_a_strip_covers_its_area_around_its_middle(v, u, angle, length, radius):
     region = Shape(name="strip", outlines=(corners,)).region(SIZE)
     assert region.mask.sum() == pytest.approx(2 * radius * length, abs=length + 2 * radius)
     rows, columns = np.nonzero(region.mask)
-    assert columns.mean() + region.left + 0.5 == pytest.approx(u, abs=0.6)
-    assert rows.mean() + region.top + 0.5 == pytest.approx(v, abs=0.6)
+    middle = np.array([columns.mean() + region.left, rows.mean() + region.top]) + 0.5
+    assert abs((middle - [u, v]) @ across) < 0.6 * radius
+    assert abs((middle - [u, v]) @ along) < 1.5
