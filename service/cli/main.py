@@ -12,6 +12,7 @@ from service.cli.recover import recover
 from service.cli.replay import replay
 from service.cli.scan import scan
 from service.cli.score import score
+from service.cli.segment import segment
 from service.cli.serve import serve, worker
 from service.cli.shell import Exit, complain
 from service.cli.train import train
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for verb in (replay, inspect, score, recover, export, serve, scan, doctor, train):
+for verb in (replay, inspect, score, recover, export, serve, scan, segment, train, doctor):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from canopy_skel.errors import UsageError
-from canopy_skel.frame import Float32Array
 from canopy_skel.segmenters.labels import LabelledImage
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
