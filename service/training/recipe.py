@@ -24,7 +24,7 @@ from service.training.store import StoredImages
 
 WANTED_PRECISION = 0.87
 _CANDIDATES = 5
-_UNCALIBRATED = Calibration(weights=(4.0, 2.0, 2.0, 0.0, 0.3, 0.0), bias=-6.0)
+UNCALIBRATED = Calibration(weights=(4.0, 2.0, 2.0, 0.0, 0.3, 0.0), bias=-6.0)
 BUILTIN_PLAN = Plan(steps=8000)
 
 Progress = Callable[[str, int, int], None]
@@ -116,7 +116,7 @@ def _candidate(
         network=network.eval(),
         channels=channels,
         grouping=Grouping(),
-        calibration=_UNCALIBRATED,
+        calibration=UNCALIBRATED,
         least_score=0.0,
     )
     return model, _again(model, images)
