@@ -87,5 +87,9 @@ def maps_of(output: Tensor) -> Maps:
 
 def normalised(pictures_rgb: UInt8Array) -> Tensor:
     """Return (N, 3, H, W) float32, channels last, of (N, H, W, 3) uint8 pictures."""
-    tensor = torch.from_numpy(pictures_rgb).permute(0, 3, 1, 2)
-    return (tensor.float() / 255.0 - _MEAN) / _SCALE
+    return scaled(torch.from_numpy(pictures_rgb).permute(0, 3, 1, 2).float())
+
+
+def scaled(pictures_rgb: Tensor) -> Tensor:
+    """Return (N, 3, H, W) pictures of 0 to 255 as the network wants them."""
+    return (pictures_rgb / 255.0 - _MEAN) / _SCALE
