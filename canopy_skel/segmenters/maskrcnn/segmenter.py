@@ -86,7 +86,7 @@ def _fitting(color: UInt8Array, size_px: tuple[int, int]) -> UInt8Array:
     long, short = max(color.shape[:2]), min(color.shape[:2])
     scale = min(max(size_px) / long, min(size_px) / short)
     if scale >= 1:
-        return np.ascontiguousarray(color)
+        return np.array(color)  # views cannot be written, which torch warns of
     size = max(round(color.shape[1] * scale), 1), max(round(color.shape[0] * scale), 1)
     return np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 

@@ -78,8 +78,8 @@ def test_a_larger_picture_is_scaled_and_its_masks_come_back_to_its_size():
 
 def test_only_what_is_sure_enough_is_reported():
     view = view_of(drawn(BARS, SIZE).color_rgb)
-    assert len(segmenter_of(SeesBark(), least_score=0.95).segment(view)) == 2
-    assert len(segmenter_of(SeesBark(), least_score=0.96).segment(view)) == 2
+    assert len(segmenter_of(SeesBark(), least_score=0.94).segment(view)) == 2
+    assert len(segmenter_of(SeesBark(), least_score=0.96).segment(view)) == 1
     assert len(segmenter_of(SeesBark(), least_score=0.98).segment(view)) == 1
     assert segmenter_of(SeesBark(), least_score=1.0).segment(view) == []
 
@@ -102,7 +102,7 @@ def test_masks_are_joined_as_the_authors_join_them():
     assert len(merged([box(0, 0, 10, 4), box(6, 0, 10, 4)])) == 2
     assert len(merged([box(0, 0, 40, 4), box(35, 0, 8, 4)])) == 1
     # Halves of a branch are joined over the piece that overlaps both.
-    assert len(merged([box(0, 0, 20, 4), box(18, 0, 20, 4), box(8, 0, 20, 4)])) == 1
+    assert len(merged([box(0, 0, 20, 4), box(16, 0, 20, 4), box(8, 0, 20, 4)])) == 1
     assert merged([]) == []
 
 
@@ -150,26 +150,27 @@ def test_without_torchvision_one_line_says_what_to_do():
         build()
 
 
+@pytest.fixture(scope="module")
+def trained():
+    from canopy_skel.segmenters.maskrcnn.network import build
+    from service.training.maskrcnn import MaskRcnnPlan, train_maskrcnn
+
+    torch.manual_seed(1)
+    network = build("group", (96, 64))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    losses = []
+    images = [drawn([bar * [0.5, 0.5, 0.5] for bar in BARS], (64, 96), seed=s) for s in (1, 2)]
+    plan = MaskRcnnPlan(steps=4, batch=1, warm_up=1, rate=0.002)
+    steps = train_maskrcnn(
+        network, images, plan, (96, 64), lambda step, loss: losses.append((step, loss))
+    )
+    assert steps == 4
+    assert [step for step, _ in losses] == [1, 2, 3, 4]
+    return network, before, [loss for _, loss in losses]
+
+
 @needs_torchvision
 class TestNetwork:
-    @pytest.fixture(scope="class")
-    def trained(self):
-        from canopy_skel.segmenters.maskrcnn.network import build
-        from service.training.maskrcnn import MaskRcnnPlan, train_maskrcnn
-
-        torch.manual_seed(1)
-        network = build("group", (96, 64))
-        before = {name: value.clone() for name, value in network.state_dict().items()}
-        losses = []
-        images = [drawn([bar * [0.5, 0.5, 0.5] for bar in BARS], (64, 96), seed=s) for s in (1, 2)]
-        plan = MaskRcnnPlan(steps=4, batch=1, warm_up=1, rate=0.002)
-        steps = train_maskrcnn(
-            network, images, plan, (96, 64), lambda step, loss: losses.append((step, loss))
-        )
-        assert steps == 4
-        assert [step for step, _ in losses] == [1, 2, 3, 4]
-        return network, before, [loss for _, loss in losses]
-
     def test_a_few_steps_change_all_of_it_and_bring_the_loss_down(self, trained):
         network, before, losses = trained
         after = network.state_dict()
