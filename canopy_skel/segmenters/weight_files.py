@@ -60,7 +60,9 @@ def read_description(path: Path, form: str, needed: frozenset[str]) -> dict[str,
 
 
 def read_state(path: Path, sha256: str | None, most_bytes: int) -> dict[str, Tensor]:
-    """Return the tensors in a file by name, as float32, after comparing its SHA-256 (if given).
+    """Return the tensors in a file by name, as float32, after comparing its SHA-256.
+
+    sha256: its beginning is enough; None = not known.
 
     Raises:
         UsageError: it cannot be read, is too large, has another SHA-256, or holds anything but
@@ -70,8 +72,8 @@ def read_state(path: Path, sha256: str | None, most_bytes: int) -> dict[str, Ten
     found = hashlib.sha256(data).hexdigest()
     if sha256 is not None and not found.startswith(sha256):
         raise UsageError(
-            f"{path}: is not the file it should be (SHA-256 {found[:12]}…, expected"
-            f" {sha256[:12]}…), truncated or changed; copy it anew, and its JSON"
+            f"{path}: is not the file its JSON describes (SHA-256 {found[:12]}…, expected"
+            f" {sha256[:12]}…), truncated or changed; copy both files anew"
         )
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
@@ -81,7 +83,10 @@ def read_state(path: Path, sha256: str | None, most_bytes: int) -> dict[str, Ten
             " that `canopy train` wrote"
         ) from error
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise UsageError(f"{path}: holds no tensors by name; give a state dictionary")
+        raise UsageError(
+            f"{path}: is of another architecture: it holds no tensors by name; give weights of this"
+            " segmenter"
+        )
     return {str(name): _widened(value) for name, value in state.items()}
 
 

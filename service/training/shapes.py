@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from canopy_skel.geometry import BoolArray, FloatArray
-from canopy_skel.kernels import strands
 from canopy_skel.segmenters.labels import line_of_mask
 from canopy_skel.segmenters.unet.grouping import Grouping
 from service.training.run_lengths import decoded
@@ -22,6 +21,8 @@ _FINE = 4
 _INSIDE = 0.5 + 0.5 / _FINE
 _LONGEST_EDGE = 4.0
 _SLENDER = 2.0
+_SHORTEST_PX = 12.0
+_MOST_BINS = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -95,15 +96,47 @@ def connected(region: Region) -> list[Region]:
 
 
 def straight(part: Region) -> list[Region]:
-    """Cut a connected region where it bends, by the rule of the segmenter's own grouping."""
-    grouping = Grouping()
-    width = extent(part)[1]
-    label = np.ascontiguousarray(part.mask, dtype=np.int32)
-    log_radius = np.full(label.shape, np.log(max(width / 2, 0.5)), dtype=np.float32)
-    bend = [grouping.bend_px, grouping.bend_share, grouping.bend_radii, max(12.0, width)]
-    count = strands.straightened(label, 1, log_radius, LEAST_PIXELS, np.array(bend))
-    pieces = [Region(left=part.left, top=part.top, mask=label == k) for k in range(1, count + 1)]
-    return [_cropped(piece) for piece in pieces]
+    """Cut a connected region where it bends, by the measures of the segmenter's own grouping."""
+    at = _bend(part)
+    if at is None:
+        return [part]
+    along, _ = _axes(part)
+    sides = (along < at, along >= at)
+    halves = [np.zeros(part.mask.shape, dtype=np.bool_) for _ in sides]
+    rows, columns = np.nonzero(part.mask)
+    for half, side in zip(halves, sides, strict=True):
+        half[rows[side], columns[side]] = True
+    cut = [Region(left=part.left, top=part.top, mask=half) for half in halves]
+    pieces = [piece for half in cut for piece in connected(half)]
+    large = [piece for piece in pieces if piece.mask.sum() >= LEAST_PIXELS]
+    return [piece for one in large for piece in straight(one)]
+
+
+def _axes(part: Region) -> tuple[FloatArray, FloatArray]:
+    """Return where the pixels of a region are along and across its principal axis, (N,) each."""
+    rows, columns = np.nonzero(part.mask)
+    points = np.stack([columns, rows], axis=1).astype(np.float64)
+    points -= points.mean(axis=0)
+    axes = np.linalg.eigh(points.T @ points)[1]
+    return points @ axes[:, 1], points @ axes[:, 0]
+
+
+def _bend(part: Region) -> float | None:
+    """Return where along its axis a region is farthest from its chord, None if near enough."""
+    along, across = _axes(part)
+    low, length = float(along.min()), float(np.ptp(along)) + 1.0
+    width = len(along) / length
+    if length < max(_SHORTEST_PX, _SLENDER * width):
+        return None
+    count = int(np.clip(length / 4, 3, _MOST_BINS))
+    place = np.minimum(((along - low) / length * count).astype(np.int64), count - 1)
+    pixels = np.maximum(np.bincount(place, minlength=count), 1)
+    offset = np.bincount(place, across, count) / pixels
+    away = np.abs(offset - np.linspace(offset[0], offset[-1], count))
+    worst = int(away.argmax())
+    rule = Grouping()
+    allowed = max(rule.bend_px, rule.bend_share * length, rule.bend_radii * width / 2)
+    return low + (worst + 0.5) / count * length if away[worst] > allowed else None
 
 
 def extent(part: Region) -> tuple[float, float]:

@@ -40,7 +40,7 @@ def test_a_truncated_or_changed_file_is_not_opened(path):
     data = path.read_bytes()
     for broken in (data[:-1], data[:10], b"", data[:50] + b"x" + data[51:]):
         path.write_bytes(broken)
-        with pytest.raises(UsageError, match=r"w\.pt: is not the file it should be"):
+        with pytest.raises(UsageError, match=r"w\.pt: is not the file its JSON describes"):
             read(path)
 
 
@@ -52,10 +52,10 @@ class Evil:
 @pytest.mark.parametrize("content", [{"a": Evil()}, Evil(), [1, 2], {"a": 5}])
 def test_code_and_other_objects_are_refused_even_with_a_right_digest(path, content, capsys):
     torch.save(content, path)
-    with pytest.raises(UsageError, match=r"w\.pt: holds"):
+    with pytest.raises(UsageError, match=r"w\.pt: (holds something other|is of another arch)"):
         read_state(path, None, MOST)
     path.write_bytes(pickle.dumps(content))
-    with pytest.raises(UsageError, match=r"w\.pt: holds"):
+    with pytest.raises(UsageError, match=r"w\.pt: (holds something other|is of another arch)"):
         read_state(path, None, MOST)
     assert "must not run" not in capsys.readouterr().out
 
