@@ -59,7 +59,8 @@ figures: $(READY)
 
 # The paper's Mask R-CNN has a torch of its own (5.5 GB); its tests are skipped elsewhere.
 maskrcnn: $(MASKRCNN)/.ready
-	$(MASKRCNN)/bin/python -m pytest -rs tests/canopy_skel/segmenters/test_maskrcnn.py
+	$(MASKRCNN)/bin/python -m pytest -rs --timeout 1200 \
+		tests/canopy_skel/segmenters/test_maskrcnn.py
 
 $(MASKRCNN)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(MASKRCNN)

@@ -188,5 +188,5 @@ def evaluate_recording(
     """
     recording = read_recording(path)
     scores, pace = evaluate(recorded_labels(recording), segmenter, threshold)
-    ends = {} if name == "recorded" else skeletons(recording, name, weights, memory_limit_bytes)
+    ends = skeletons(recording, name, weights, memory_limit_bytes)
     return Evaluation(source=str(path), scores=scores, pace=pace, skeleton=ends)

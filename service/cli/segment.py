@@ -125,6 +125,8 @@ def _evaluate(
 
     if bool(sources) is bool(coco or labelme):
         raise UsageError("--evaluate needs recordings, or labels (--coco with --images, --labelme)")
+    if name == "recorded":
+        raise UsageError("recorded instances are what is compared with; choose unet or maskrcnn")
     made, threshold = make_for_judging(name, weights)
     found: list[Evaluation] = []
     for path in sources:

@@ -141,17 +141,38 @@ def test_a_recording_gets_a_copy_with_instances(canopy, recording, tmp_path, wei
     assert "is there already" in stderr
 
 
-def test_a_segmenter_judged_by_its_own_instances_is_perfect(canopy, recording):
-    code, stdout, _ = canopy(
-        "segment", "--evaluate", recording, "--segmenter", "recorded", "--json"
-    )
+def test_a_recording_judges_instances_and_the_skeleton_they_lead_to(
+    canopy, recording, tmp_path, weights
+):
+    canopy("replay", recording, "-o", tmp_path, "--formats", "json")
+    truth = (tmp_path / "sticks.skeleton.json").read_bytes()
+    path = tmp_path / "with_truth.mcap"
+    with RecordingWriter(path, {"scan_id": "s"}, tool_from_camera=np.eye(4)) as writer:
+        for view in read_recording(recording).views():
+            writer.write_view(view)
+        writer.attach("ground_truth_skeleton.json", "application/json", truth)
+    code, stdout, _ = canopy("segment", "--evaluate", path, "--weights", weights, "--json")
     assert code == 0
     (result,) = json.loads(stdout)
     scores = result["scores"]
-    assert (scores["pixel_iou"], scores["ap50"], scores["pictures"]) == (1, 1, 2)
-    assert scores["instances_found"] == scores["instances_true"] == 6
+    assert (scores["pictures"], scores["instances_true"], scores["instances_found"]) == (2, 6, 2)
+    assert scores["pixel_recall"] == 1.0
+    assert scores["pixel_iou"] == pytest.approx(scores["pixel_precision"]) < 0.2
+    assert scores["precision"] == scores["line_ap"] == 0.0
+    assert scores["ece_wood"] == pytest.approx(1 / (1 + np.exp(-1)))
     assert result["pace"]["size_px"] == [320, 240]
     assert result["pace"]["cpu"]
+    skeleton = result["skeleton"]
+    assert skeleton["recorded"]["precision"] == skeleton["recorded"]["recall"] == 1.0
+    assert skeleton["unet"]["recall"] < 1.0
+    assert skeleton["ratio"]["recall"] == pytest.approx(skeleton["unet"]["recall"])
+
+
+def test_recorded_instances_are_what_is_compared_with(canopy, recording):
+    arguments = ("--evaluate", recording, "--segmenter", "recorded")
+    code, _, stderr = canopy("segment", *arguments)
+    assert code == 2
+    assert "recorded instances are what is compared with; choose unet or maskrcnn" in stderr
 
 
 @pytest.fixture

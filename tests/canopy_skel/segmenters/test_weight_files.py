@@ -54,7 +54,7 @@ def test_code_and_other_objects_are_refused_even_with_a_right_digest(path, conte
     torch.save(content, path)
     with pytest.raises(UsageError, match=r"w\.pt: (holds something other|is of another arch)"):
         read_state(path, None, MOST)
-    path.write_bytes(pickle.dumps(content))
+    path.write_bytes(pickle.dumps(content, protocol=2))
     with pytest.raises(UsageError, match=r"w\.pt: (holds something other|is of another arch)"):
         read_state(path, None, MOST)
     assert "must not run" not in capsys.readouterr().out
