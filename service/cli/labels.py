@@ -1,6 +1,7 @@
 """Labelled pictures that the command line is given."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,22 +21,34 @@ Branch = Annotated[
 ]
 
 
-def labelled_pictures(
-    coco: Path | None, images: Path | None, labelme: Path | None, branch: Sequence[str]
-) -> list[UserPicture]:
-    """Return the pictures of a COCO file or of a folder of LabelMe files; warn on stderr.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Labels:
+    """Where the labels are, as options said it."""
 
-    Raises:
-        UsageError: not exactly one of them is given, or it is unusable.
-    """
-    if (coco is None) is (labelme is None):
-        raise UsageError("give labels: either --coco FILE with --images DIR, or --labelme DIR")
-    if coco is not None:
-        if images is None:
+    coco: Path | None
+    images: Path | None
+    labelme: Path | None
+    branch: Sequence[str]
+
+    @property
+    def source(self) -> Path | None:
+        """The file or folder of labels, None if none is given."""
+        return self.coco or self.labelme
+
+    def pictures(self) -> list[UserPicture]:
+        """Return the labelled pictures; warn on stderr.
+
+        Raises:
+            UsageError: not exactly one kind of labels is given, or they are unusable.
+        """
+        if (self.coco is None) is (self.labelme is None):
+            raise UsageError("give labels: either --coco FILE with --images DIR, or --labelme DIR")
+        if self.labelme is not None:
+            pictures, notes = read_labelme(self.labelme, self.branch)
+        elif self.coco is None or self.images is None:
             raise UsageError("--coco needs --images, the folder of its pictures")
-        pictures, notes = read_coco(coco, images, branch)
-    elif labelme is not None:
-        pictures, notes = read_labelme(labelme, branch)
-    for note in notes:
-        stderr.print(f"warning: {note}", style="yellow", markup=False)
-    return pictures
+        else:
+            pictures, notes = read_coco(self.coco, self.images, self.branch)
+        for note in notes:
+            stderr.print(f"warning: {note}", style="yellow", markup=False)
+        return pictures

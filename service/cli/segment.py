@@ -2,19 +2,22 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.segment import Segmenter
-from service.cli.evaluate import print_evaluation
-from service.cli.labels import Branch, Coco, Images, LabelMe, labelled_pictures
+from service.cli.labels import Branch, Coco, Images, LabelMe, Labels
+from service.cli.replay import MOST_MAP_MEMORY
 from service.cli.shell import AsJson, Exit, complain, progress_bars, stderr
 from service.outputs import require_writable
 from service.picture_files import SUFFIXES
 from service.segmenters import NAMES, make_for_judging, make_segmenter
 from service.segmenting import Segmented, segment_picture, segment_recording
+
+if TYPE_CHECKING:
+    from service.evaluation import Evaluation
 
 Name = Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")]
 Weights = Annotated[Path | None, typer.Option(help="Weights (.pt); the built-in ones if none.")]
@@ -43,10 +46,11 @@ def segment(
     Pictures get an overlay, their instances and scores; a recording a copy that holds the
     instances, ready for `canopy replay`.
     """
+    labels = Labels(coco=coco, images=images, labelme=labelme, branch=branch or ())
     if evaluate:
-        _evaluate(sources or [], segmenter, weights, coco, images, labelme, branch, as_json)
+        _say_evaluated(_evaluated(sources or [], labels, segmenter, weights), as_json)
         return
-    if coco or labelme:
+    if labels.source is not None:
         raise UsageError("labels are for --evaluate; without it give pictures or recordings")
     if not sources or output is None:
         raise UsageError("give pictures or recordings, and a folder for the results (-o)")
@@ -108,46 +112,39 @@ def _require_distinct(sources: list[Path]) -> None:
             )
 
 
-def _evaluate(
-    sources: list[Path],
-    name: str,
-    weights: Path | None,
-    coco: Path | None,
-    images: Path | None,
-    labelme: Path | None,
-    branch: list[str] | None,
-    as_json: bool,
-) -> None:
+def _evaluated(
+    sources: list[Path], labels: Labels, name: str, weights: Path | None
+) -> "list[Evaluation]":
     # Imported here: evaluation replays recordings, which takes the whole method to load.
     from service.doctor import available_memory_bytes
     from service.evaluation import Evaluation, evaluate, evaluate_recording
     from service.training.user_pictures import UserPictures
 
-    if bool(sources) is bool(coco or labelme):
+    if bool(sources) is (labels.source is not None):
         raise UsageError("--evaluate needs recordings, or labels (--coco with --images, --labelme)")
     if name == "recorded":
         raise UsageError("recorded instances are what is compared with; choose unet or maskrcnn")
-    made, threshold = make_for_judging(name, weights)
-    found: list[Evaluation] = []
-    for path in sources:
-        found.append(
-            evaluate_recording(
-                path,
-                made,
-                threshold,
-                name=name,
-                weights=weights,
-                memory_limit_bytes=min(available_memory_bytes() // 2, 3 << 30),
-            )
-        )
     if not sources:
-        pictures = UserPictures(labelled_pictures(coco, images, labelme, branch or []))
+        pictures = UserPictures(labels.pictures())
+        made, threshold = make_for_judging(name, weights)
         every = (pictures[k] for k in range(len(pictures)))
         scores, pace = evaluate(every, made, threshold)
-        source = str(coco or labelme)
-        found.append(Evaluation(source=source, scores=scores, pace=pace, skeleton={}))
+        return [Evaluation(source=str(labels.source), scores=scores, pace=pace, skeleton={})]
+    made, threshold = make_for_judging(name, weights)
+    memory = min(available_memory_bytes() // 2, MOST_MAP_MEMORY)
+    return [
+        evaluate_recording(
+            path, made, threshold, name=name, weights=weights, memory_limit_bytes=memory
+        )
+        for path in sources
+    ]
+
+
+def _say_evaluated(results: "list[Evaluation]", as_json: bool) -> None:
+    from service.cli.evaluate import print_evaluation
+
     if as_json:
-        typer.echo(json.dumps([one.to_dict() for one in found], indent=2))
+        typer.echo(json.dumps([one.to_dict() for one in results], indent=2))
         return
-    for one in found:
+    for one in results:
         print_evaluation(one)

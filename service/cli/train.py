@@ -10,7 +10,7 @@ import typer
 from rich.progress import Progress, TaskID
 
 from canopy_skel.errors import UsageError
-from service.cli.labels import Branch, Coco, Images, LabelMe, labelled_pictures
+from service.cli.labels import Branch, Coco, Images, LabelMe, Labels
 from service.cli.shell import AsJson, Out, progress_bars, stderr
 from service.outputs import require_writable
 from service.training.user_pictures import UserPicture
@@ -68,13 +68,13 @@ def train(
         raise UsageError(f"unknown segmenter {segmenter!r}: choose one of {', '.join(NETWORKS)}")
     length = _Length(minutes=minutes, steps=steps)
     weights = output / f"{segmenter}.pt"
-    if coco is None and labelme is None:
+    labels = Labels(coco=coco, images=images, labelme=labelme, branch=branch or ())
+    if labels.source is None:
         facts = _by_recipe(output, recipe or BUILTIN, segmenter, length, scenes)
     elif recipe is not None or scenes is not None:
         raise UsageError("give either labels (--coco, --labelme) or --recipe")
     else:
-        pictures = labelled_pictures(coco, images, labelme, branch or [])
-        facts = _on_labels(output, pictures, segmenter, init, length)
+        facts = _on_labels(output, labels.pictures(), segmenter, init, length)
     if as_json:
         typer.echo(json.dumps(facts, indent=2))
         return
