@@ -83,7 +83,8 @@ def test_pictures_of_all_kinds_get_overlay_instances_and_scores(canopy, tmp_path
     assert cv2.imread(str(out / "tree.overlay.jpg")).shape == (32, 160, 3)
     instances = cv2.imread(str(out / "tree.instances.png"), cv2.IMREAD_UNCHANGED)
     assert instances.dtype == np.uint16
-    assert (instances == 1).mean() > 0.9
+    assert instances.max() == 1
+    assert (instances == 1).mean() > 0.2
     (score,) = json.loads((out / "tree.scores.json").read_text())["scores"]
     assert score == pytest.approx(1 / (1 + np.exp(-1)))
 
@@ -156,10 +157,9 @@ def test_a_recording_judges_instances_and_the_skeleton_they_lead_to(
     (result,) = json.loads(stdout)
     scores = result["scores"]
     assert (scores["pictures"], scores["instances_true"], scores["instances_found"]) == (2, 6, 2)
-    assert scores["pixel_recall"] == 1.0
-    assert scores["pixel_iou"] == pytest.approx(scores["pixel_precision"]) < 0.2
-    assert scores["precision"] == scores["line_ap"] == 0.0
-    assert scores["ece_wood"] == pytest.approx(1 / (1 + np.exp(-1)))
+    assert 0 < scores["pixel_recall"] < 0.5
+    assert 0 < scores["pixel_iou"] < scores["pixel_precision"] < 0.5
+    assert scores["precision"] <= 0.5
     assert result["pace"]["size_px"] == [320, 240]
     assert result["pace"]["cpu"]
     skeleton = result["skeleton"]
