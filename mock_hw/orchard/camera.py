@@ -1,10 +1,11 @@
 """The simulated stereo camera: what it sees of a scene from any pose."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from canopy_skel.errors import UsageError
 from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array, View
 from canopy_skel.geometry import FloatArray, transform_from
 from mock_hw.orchard import renderer
@@ -37,6 +38,32 @@ class Shot:
     view: View
     picture: Picture
     fragments: Fragments
+
+
+def scaled(camera: Camera, scale: float) -> Camera:
+    """Return the camera with pictures of another size that show the same.
+
+    Raises:
+        UsageError: the scale leaves no picture, or is more than 1.
+    """
+    one = camera.intrinsics
+    size_px = scale * one.width_px, scale * one.height_px
+    if not (0 < scale <= 1 and min(size_px) >= 1):
+        raise UsageError(f"no pictures scaled by {scale}; give more than 0, up to 1")
+    width_px, height_px = map(round, size_px)
+    across, down = width_px / one.width_px, height_px / one.height_px
+    # Pixel centres are at whole numbers, so the picture's corner is at -0.5.
+    return replace(
+        camera,
+        intrinsics=Intrinsics(
+            fx_px=across * one.fx_px,
+            fy_px=down * one.fy_px,
+            cx_px=across * (one.cx_px + 0.5) - 0.5,
+            cy_px=down * (one.cy_px + 0.5) - 0.5,
+            width_px=width_px,
+            height_px=height_px,
+        ),
+    )
 
 
 def render_view(
@@ -75,7 +102,8 @@ def shoot(
     fragments = fragments_in(scene, picture, base_from_camera, intrinsics)
     instances, scores = instances_of(fragments, rng)
     right_pose = base_from_camera @ transform_from(np.eye(3), [camera.baseline_m, 0, 0])
-    right = renderer.draw(scene.mesh, right_pose, intrinsics)
+    both = camera.depth or camera.pair
+    right = renderer.draw(scene.mesh, right_pose, intrinsics) if both else picture
     view = View(
         index=index,
         stamp_ns=stamp_ns,

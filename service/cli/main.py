@@ -5,6 +5,7 @@ import sys
 import typer
 
 from canopy_skel.errors import CanopyError, UsageError
+from service.cli.coco import coco
 from service.cli.doctor import doctor
 from service.cli.export import export
 from service.cli.export_onnx import export_onnx
@@ -16,6 +17,7 @@ from service.cli.score import score
 from service.cli.segment import segment
 from service.cli.serve import serve, worker
 from service.cli.shell import Exit, complain
+from service.cli.simulate import simulate
 from service.cli.train import train
 
 app = typer.Typer(
@@ -33,6 +35,8 @@ for verb in (
     export,
     serve,
     scan,
+    simulate,
+    coco,
     segment,
     train,
     export_onnx,
