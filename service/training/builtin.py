@@ -6,7 +6,7 @@ from pathlib import Path
 
 from canopy_skel.segmenters.labels import LabelledImage
 from mock_hw.orchard.presets import APPLE, OAK, WALNUT
-from mock_hw.orchard.training.frames import FRAMES_PER_SCENE, Variety, scene_frames
+from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
 from service.training.store import store
 
 TRAIN = Variety(seed=20260101, species=(APPLE, OAK))

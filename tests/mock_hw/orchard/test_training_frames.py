@@ -3,9 +3,9 @@ import pytest
 from scipy.ndimage import label as regions
 
 from mock_hw.orchard.presets import WALNUT
-from mock_hw.orchard.training import clutter
-from mock_hw.orchard.training.frames import FRAMES_PER_SCENE, Variety, scene_frames
-from mock_hw.orchard.training.labels import LEAST_PIXELS, labels_in
+from mock_hw.orchard.composed import clutter
+from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
+from mock_hw.orchard.composed.labels import LEAST_PIXELS, labels_in
 
 SMALL = Variety(seed=5, width_px=320, height_px=240)
 

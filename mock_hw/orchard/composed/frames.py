@@ -15,8 +15,8 @@ from mock_hw.orchard.mesh import Int32Array, Kind
 from mock_hw.orchard.presets import APPLE, OAK
 from mock_hw.orchard.scene import Scene, build_scene
 from mock_hw.orchard.species import Species
-from mock_hw.orchard.training import clutter, varied
-from mock_hw.orchard.training.labels import labels_in
+from mock_hw.orchard.composed import clutter, varied
+from mock_hw.orchard.composed.labels import labels_in
 from mock_hw.orchard.tree import grow
 
 FRAMES_PER_SCENE = 4
