@@ -2,12 +2,13 @@
 PYTHON ?= python3
 RECORDING ?= recordings/demo_apple.mcap
 VENV := .venv
+MASKRCNN := .venv-maskrcnn
 BIN := $(VENV)/bin
 VALIDATOR := $(VENV)/gltf_validator
 RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
 
-.PHONY: setup demo demo-replay test check bench bench-scan results departures figures
+.PHONY: setup demo demo-replay test check bench bench-scan results departures figures maskrcnn
 
 setup: $(READY)
 
@@ -58,3 +59,16 @@ departures: $(READY)
 # The figures of docs/method.md; the ones in the repository are of a longer recording.
 figures: $(READY)
 	$(BIN)/python docs/figures.py $(RECORDING) --output docs/images/method
+
+# The paper's Mask R-CNN has a torch of its own (5.5 GB); its tests are skipped elsewhere.
+maskrcnn: $(MASKRCNN)/.ready
+	$(MASKRCNN)/bin/python -m pytest -rs --timeout 1200 \
+		tests/canopy_skel/segmenters/test_maskrcnn.py
+
+$(MASKRCNN)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(MASKRCNN)
+	grep -v '^torch==' constraints.txt > $(MASKRCNN)/constraints.txt
+	$(MASKRCNN)/bin/pip install --quiet --disable-pip-version-check torch==2.14.1 torchvision==0.29.1
+	$(MASKRCNN)/bin/pip install --quiet --disable-pip-version-check \
+		-c $(MASKRCNN)/constraints.txt -e '.[dev,maskrcnn]'
+	touch $@

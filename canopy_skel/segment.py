@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from canopy_skel.frame import View
+import numpy as np
+
+from canopy_skel.frame import UInt16Array, View
 from canopy_skel.geometry import BoolArray
 
 
@@ -33,3 +35,19 @@ class Segmenter(Protocol):
             ViewError: the view lacks what this segmenter needs.
         """
         ...
+
+
+def painted(
+    masks: Sequence[BranchMask], size: tuple[int, int]
+) -> tuple[UInt16Array, tuple[float, ...]]:
+    """Return the (height, width) picture of instances, 0 = none, and their confidences.
+
+    They are numbered 1, 2, … in the order given; where they overlap, the surest is in front.
+    """
+    picture = np.zeros(size, dtype=np.uint16)
+    for place in sorted(range(len(masks)), key=lambda place: masks[place].confidence):
+        mask = masks[place]
+        height, width = mask.mask.shape
+        box = picture[mask.top_px : mask.top_px + height, mask.left_px : mask.left_px + width]
+        box[mask.mask] = place + 1
+    return picture, tuple(mask.confidence for mask in masks)

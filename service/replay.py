@@ -18,24 +18,29 @@ from canopy_skel.pipeline import Extraction, MethodConfig, Skeletonizer
 from canopy_skel.recording import Recording, TopicOptions, read_recording
 from drivers.stereo import with_depth
 from service.outputs import write_all
-from service.skeletons import SEGMENTERS, document_of
+from service.segmenters import NAMES, make_segmenter
+from service.skeletons import document_of
 from service.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReplayRequest:
-    """What to replay a recording with. memory_limit_bytes: for the likelihood map."""
+    """What to replay a recording with.
+
+    memory_limit_bytes: for the likelihood map. weights: of the segmenter, if not its own.
+    """
 
     config: MethodConfig
     segmenter: str
     formats: tuple[str, ...]
     topics: TopicOptions | None
     memory_limit_bytes: int
+    weights: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse names that are not known."""
-        if self.segmenter not in SEGMENTERS:
-            known = ", ".join(SEGMENTERS)
+        if self.segmenter not in NAMES:
+            known = ", ".join(NAMES)
             raise UsageError(f"unknown segmenter {self.segmenter!r}: choose one of {known}")
         for name in self.formats:
             if name not in FORMATS:
@@ -111,7 +116,7 @@ def _walk_views(
 ) -> _Walk:
     walk = _Walk(
         skeletonizer=Skeletonizer(
-            SEGMENTERS[request.segmenter](),
+            make_segmenter(request.segmenter, request.weights),
             request.config,
             stage=stopwatch,
             memory_limit_bytes=request.memory_limit_bytes,

@@ -1,14 +1,18 @@
 """What live scans and replays share, so that both give the same bytes."""
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from importlib.metadata import version
 
 from canopy_skel.document import Method, RejectedView, SkeletonDocument, build_document
 from canopy_skel.pipeline import Extraction, Skeletonizer
 from canopy_skel.segment import Segmenter
-from canopy_skel.segmenters.recorded import RecordedSegmenter
+from service.segmenters import make_segmenter
 
-SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"recorded": RecordedSegmenter}
+# Those a live scan may choose; `service.segmenters` has all, and those with weights of the user's.
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {
+    name: partial(make_segmenter, name) for name in ("recorded", "unet")
+}
 SOFTWARE = f"canopy-skel {version('canopy-skel')}"
 
 

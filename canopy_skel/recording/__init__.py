@@ -1,5 +1,6 @@
 """Recordings (MCAP): read, write, recover and cut; nothing else in the method touches files."""
 
+from canopy_skel.recording.annotate import annotate
 from canopy_skel.recording.carry import carry_over
 from canopy_skel.recording.decode import view_from_messages
 from canopy_skel.recording.encode import EncodedPicture, encode_view
@@ -16,6 +17,7 @@ __all__ = [
     "RecoverReport",
     "TopicOptions",
     "TopicSummary",
+    "annotate",
     "carry_over",
     "cut_recording",
     "encode_view",

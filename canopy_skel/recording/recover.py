@@ -1,16 +1,17 @@
 """Rewriting recordings: a cut one into a whole one, a long one into a few views."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.writer import Writer
 
 from canopy_skel.errors import RecordingError, UsageError
+from canopy_skel.messages import Message
 from canopy_skel.recording.mcap_file import McapFile, MessageReader, MessageRef, scan_mcap
 from canopy_skel.recording.options import EXPOSURE_ROLES, TopicOptions
 from canopy_skel.recording.reader import RECOVERY_RECORD, read_recording
-from canopy_skel.recording.writer import open_new, publish, start_writer
+from canopy_skel.recording.writer import add_message, open_new, publish, register, start_writer
 
 _LARGE_CHUNK = 8 << 20
 
@@ -53,7 +54,7 @@ def recover(
     marks = {}
     if incomplete:
         marks[RECOVERY_RECORD] = {"incomplete_views": ",".join(map(str, incomplete))}
-    messages = _rewrite(file, Path(target), lambda ref: True, marks)
+    messages = rewrite(file, Path(target), lambda ref: True, marks)
     return RecoverReport(
         source=file.path,
         target=Path(target),
@@ -98,7 +99,7 @@ def cut_recording(
     def wanted(ref: MessageRef) -> bool:
         return ref in keep or channels[ref.channel_id].topic not in pictures
 
-    _rewrite(recording.file, Path(target), wanted, {})
+    rewrite(recording.file, Path(target), wanted, {})
 
 
 def _count_views(path: Path, topics: TopicOptions | None) -> tuple[int, tuple[int, ...]]:
@@ -111,13 +112,20 @@ def _count_views(path: Path, topics: TopicOptions | None) -> tuple[int, tuple[in
     return whole, recording.incomplete_views
 
 
-def _rewrite(
+def rewrite(
     file: McapFile,
     target: Path,
     wanted: Callable[[MessageRef], bool],
     marks: Mapping[str, dict[str, str]],
+    following: Callable[[MessageRef], Iterable[Message]] = lambda ref: (),
 ) -> int:
-    """Write the wanted messages and all the rest to a new file; return how many messages."""
+    """Write the wanted messages and all the rest to a new file; return how many were copied.
+
+    marks: metadata to add. following: messages to add after a copied one.
+
+    Raises:
+        RecordingError: the target is there already, or a file cannot be read or written.
+    """
     refs = [ref for ref in file.messages if ref.channel_id in file.channels and wanted(ref)]
     part = target.with_name(target.name + ".copy.part")
     stream = open_new(target, part, over_leftover=True)
@@ -128,7 +136,7 @@ def _rewrite(
                 writer.add_metadata(record.name, record.metadata)
             for name, content in marks.items():
                 writer.add_metadata(name, content)
-            _copy_messages(file, writer, refs)
+            _copy_messages(file, writer, refs, following)
             for attachment in file.attachments:
                 writer.add_attachment(
                     attachment.create_time_ns,
@@ -145,11 +153,17 @@ def _rewrite(
     return len(refs)
 
 
-def _copy_messages(file: McapFile, writer: Writer, refs: list[MessageRef]) -> None:
+def _copy_messages(
+    file: McapFile,
+    writer: Writer,
+    refs: list[MessageRef],
+    following: Callable[[MessageRef], Iterable[Message]],
+) -> None:
     """Copy messages; a chunk ends where it ends in the source, or when it is large."""
     reader = MessageReader(file)
     schemas = {0: 0}
     channels: dict[int, int] = {}
+    added: dict[str, int] = {}
     chunk_offset, chunk_size = refs[0].chunk_offset if refs else None, 0
     for ref in refs:
         if ref.chunk_offset != chunk_offset or chunk_size > _LARGE_CHUNK:
@@ -172,4 +186,8 @@ def _copy_messages(file: McapFile, writer: Writer, refs: list[MessageRef]) -> No
             publish_time=ref.publish_time_ns,
             sequence=ref.sequence,
         )
+        for message in following(ref):
+            if message.topic not in added:
+                added[message.topic] = register(writer, message.topic)
+            add_message(writer, added[message.topic], message)
     writer.flush()

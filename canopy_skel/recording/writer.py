@@ -135,20 +135,8 @@ class RecordingWriter:
 
     def _add(self, message: Message) -> None:
         if message.topic not in self._channels:
-            topic = TOPICS[message.topic]
-            schema_id = self._writer.register_schema(
-                topic.schema, topic.schema_encoding, topic.schema_data()
-            )
-            self._channels[topic.name] = self._writer.register_channel(
-                topic.name, topic.message_encoding, schema_id
-            )
-        self._writer.add_message(
-            channel_id=self._channels[message.topic],
-            log_time=message.stamp_ns,
-            publish_time=message.stamp_ns,
-            sequence=message.sequence,
-            data=message.data,
-        )
+            self._channels[message.topic] = register(self._writer, message.topic)
+        add_message(self._writer, self._channels[message.topic], message)
 
     def _sync(self) -> None:
         self._stream.flush()
@@ -167,6 +155,24 @@ def start_writer(
     )
     writer.start(profile=profile, library=_LIBRARY)
     return writer
+
+
+def register(writer: Writer, name: str) -> int:
+    """Register one of canopy's topics; return the id of its channel."""
+    topic = TOPICS[name]
+    schema_id = writer.register_schema(topic.schema, topic.schema_encoding, topic.schema_data())
+    return writer.register_channel(topic.name, topic.message_encoding, schema_id)
+
+
+def add_message(writer: Writer, channel_id: int, message: Message) -> None:
+    """Write a message to a registered channel."""
+    writer.add_message(
+        channel_id=channel_id,
+        log_time=message.stamp_ns,
+        publish_time=message.stamp_ns,
+        sequence=message.sequence,
+        data=message.data,
+    )
 
 
 def open_new(path: Path, part: Path, *, over_leftover: bool = False) -> BinaryIO:

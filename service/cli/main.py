@@ -9,14 +9,17 @@ from service.cli.coco import coco
 from service.cli.doctor import doctor
 from service.cli.experiment import experiment
 from service.cli.export import export
+from service.cli.export_onnx import export_onnx
 from service.cli.inspect import inspect
 from service.cli.recover import recover
 from service.cli.replay import replay
 from service.cli.scan import scan
 from service.cli.score import score
+from service.cli.segment import segment
 from service.cli.serve import serve, worker
 from service.cli.shell import Exit, complain
 from service.cli.simulate import simulate
+from service.cli.train import train
 
 app = typer.Typer(
     name="canopy",
@@ -25,7 +28,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for verb in (replay, inspect, score, recover, export, serve, scan, simulate, coco, doctor):
+for verb in (
+    replay,
+    inspect,
+    score,
+    recover,
+    export,
+    serve,
+    scan,
+    simulate,
+    coco,
+    segment,
+    train,
+    export_onnx,
+    doctor,
+):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)
 app.add_typer(experiment)

@@ -17,6 +17,7 @@ from service.doctor import available_memory_bytes
 from service.outputs import require_writable
 from service.replay import ReplayRequest, ReplayResult
 from service.replay import replay as replay_recording
+from service.segmenters import NAMES
 
 MOST_MAP_MEMORY = 3 << 30
 
@@ -25,7 +26,8 @@ def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
-    segmenter: Annotated[str, typer.Option(help="Where branch masks come from.")] = "recorded",
+    segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")] = "recorded",
+    weights: Annotated[Path | None, typer.Option(help="Weights of the segmenter (.pt).")] = None,
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
     formats: Annotated[str, typer.Option(help=f"Of {','.join(FORMATS)}.")] = "json,glb",
     topic: Annotated[
@@ -41,6 +43,7 @@ def replay(
             likelihood=LikelihoodConfig(voxel_size_m=voxel),
         ),
         segmenter=segmenter,
+        weights=weights,
         formats=tuple(formats.split(",")),
         topics=topic_options(topic or []),
         memory_limit_bytes=min(available_memory_bytes() // 2, MOST_MAP_MEMORY),

@@ -8,6 +8,7 @@ import typer
 from canopy_skel.pipeline import METHODS
 from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
 from service.outputs import require_writable, write_all
+from service.skeletons import SEGMENTERS
 
 
 def scan(
@@ -15,6 +16,7 @@ def scan(
     tree: Annotated[str, typer.Option(help="Which tree this is.")] = "tree",
     path: Annotated[str, typer.Option(help="Named path of waypoints.")] = "orchard-10",
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(SEGMENTERS)}.")] = "recorded",
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
     url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
     as_json: AsJson = False,
@@ -35,6 +37,7 @@ def scan(
                 stderr.print(f"{event.kind}: {status.detail or dict(event.fields)}", markup=False)
 
         body = {"tree_id": tree, "path": path, "method": method, "voxel_size_m": voxel}
+        body["segmenter"] = segmenter
         result = run_scan(url, body, show)
     status = result.status
     contents = {f"{status.scan_id}.mcap": fetch(url, f"/v1/scans/{status.scan_id}/recording.mcap")}

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from secrets import token_hex
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,6 +84,10 @@ class ScanBody(PlanBody):
     tree_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     method: MethodName = "paper"
     voxel_size_m: Annotated[float, Field(ge=0.001, le=0.05, allow_inf_nan=False)] = 0.005
+    segmenter: Annotated[
+        Literal["recorded", "unet"],
+        Field(description="where branch masks come from: the recording, or the learned segmenter"),
+    ] = "recorded"
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
 
 
@@ -126,6 +130,7 @@ def scan_spec(
         plan_spec(body, paths, caps),
         tree_id=body.tree_id,
         config=method_config(body.method, body.voxel_size_m),
+        segmenter=body.segmenter,
         retakes=body.retakes,
     )
 

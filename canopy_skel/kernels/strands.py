@@ -1,0 +1,335 @@
+"""From maps of middle line, direction and radius to strands: thinned, chained, cut, grown out.
+
+Cells are those of the network's output grid; lengths and radii here are in cells, u to the right
+and v down. A cell of a middle line links to at most one cell ahead and one behind, so that a fork never
+makes one strand of two branches.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+ACROSS = 0.35
+"""How far aside a link may jump, in radii; the half width of a middle line's band."""
+
+
+@njit(cache=True, nogil=True)
+def smoothed(inside: Bool, maps: F32, out: F32) -> None:
+    """Fill out (K, h, w) with the mean of the maps over those of 3 x 3 cells that are inside."""
+    count, height, width = maps.shape
+    for i in range(height):
+        for j in range(width):
+            if not inside[i, j]:
+                continue
+            near = 0
+            for k in range(count):
+                out[k, i, j] = 0.0
+            for a in range(max(i - 1, 0), min(i + 2, height)):
+                for b in range(max(j - 1, 0), min(j + 2, width)):
+                    if inside[a, b]:
+                        near += 1
+                        for k in range(count):
+                            out[k, i, j] += maps[k, a, b]
+            for k in range(count):
+                out[k, i, j] /= near
+
+
+@njit(cache=True)
+def _joins_nothing(core: Bool, i: int, j: int) -> bool:
+    """Say whether a cell is neither the end of a line nor what holds two parts together."""
+    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
+    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
+    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
+    parts = int(not p2 and (p3 or p4)) + int(not p4 and (p5 or p6))
+    parts += int(not p6 and (p7 or p8)) + int(not p8 and (p9 or p2))
+    if parts != 1:
+        return False
+    one = int(p9 or p2) + int(p3 or p4) + int(p5 or p6) + int(p7 or p8)
+    two = int(p2 or p3) + int(p4 or p5) + int(p6 or p7) + int(p8 or p9)
+    return min(one, two) >= 2
+
+
+@njit(cache=True)
+def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
+    """Say whether a cell may go in this half of a round of Guo and Hall (1989)."""
+    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
+    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
+    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
+    one = int(p9 or p2) + int(p3 or p4) + int(p5 or p6) + int(p7 or p8)
+    two = int(p2 or p3) + int(p4 or p5) + int(p6 or p7) + int(p8 or p9)
+    if min(one, two) > 3 or not _joins_nothing(core, i, j):
+        return False
+    if second:
+        return not ((p2 or p3 or not p5) and p4)
+    return not ((p6 or p7 or not p9) and p8)
+
+
+@njit(cache=True, nogil=True)
+def thinned(core: Bool) -> I32:
+    """Thin a core (h, w) to lines one cell wide, in place; return (N, 2) row and column of them.
+
+    Its outermost cells must be False. No line gets shorter than half its width.
+    """
+    height, width = core.shape
+    live = np.empty((core.size, 2), dtype=np.int32)
+    count = 0
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if core[i, j]:
+                live[count, 0], live[count, 1] = i, j
+                count += 1
+    marked = np.zeros(count, dtype=np.bool_)
+    changed = True
+    while changed:
+        changed = False
+        for second in (False, True):
+            for k in range(count):
+                marked[k] = _removable(core, live[k, 0], live[k, 1], second)
+            before, count = count, _swept(core, live, marked, count)
+            changed = changed or count < before
+    for k in range(count):
+        marked[k] = _joins_nothing(core, live[k, 0], live[k, 1])
+        if marked[k]:
+            core[live[k, 0], live[k, 1]] = False
+    count = _swept(core, live, marked, count)
+    return live[:count].copy()
+
+
+@njit(cache=True)
+def _swept(core: Bool, live: I32, marked: Bool, count: int) -> int:
+    """Take marked cells out of the core and of the list of live ones; return how many are left."""
+    kept = 0
+    for k in range(count):
+        i, j = live[k, 0], live[k, 1]
+        if marked[k]:
+            core[i, j] = False
+        else:
+            live[kept, 0], live[kept, 1] = i, j
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
+def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
+    """Return what it costs to go from cell a to b, inf if it is out of the question.
+
+    The sign says whether b lies ahead of a. gate: least cosine of twice the angle between them,
+    largest logarithmic ratio of their radii.
+    """
+    x, y, log_radius = maps[0, a[0], a[1]], maps[1, a[0], a[1]], maps[2, a[0], a[1]]
+    v, w = maps[0, b[0], b[1]], maps[1, b[0], b[1]]
+    angle = 0.5 * np.arctan2(y, x)
+    c, s = np.cos(angle), np.sin(angle)
+    du, dv = b[1] - a[1], b[0] - a[0]
+    along, across = c * du + s * dv, abs(c * dv - s * du)
+    aside = max(ACROSS * np.exp(log_radius), 1.5)
+    spread = 1.0 if abs(du) <= 1 and abs(dv) <= 1 else 0.5
+    if abs(along) < 0.3 or abs(along) > window or across > min(aside, 0.3 + spread * abs(along)):
+        return np.inf
+    cosine = (x * v + y * w) / (np.sqrt((x * x + y * y) * (v * v + w * w)) + 1e-9)
+    if cosine < gate[0] or abs(maps[2, b[0], b[1]] - log_radius) > gate[1]:
+        return np.inf
+    price = abs(along) + 2.0 * across + 4.0 * (1.0 - cosine)
+    return price if along > 0 else -price
+
+
+@njit(cache=True)
+def _window(log_radius: float, tries: int) -> int:
+    """Return how far to look for the next cell; farther with each try."""
+    return int(min(max(1.0 + 1.5 * ACROSS * np.exp(log_radius), 2.0) + tries, 9.0))
+
+
+@njit(cache=True, nogil=True)
+def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
+    """Return (N, 2) the cell that each is linked with behind and ahead, -1 = none.
+
+    number: (h, w) the place in `cells`, -1 = none; cells: (N, 2) row and column. gate: see `_price`. A link is
+    made where it is the best for both of its cells among those still free on that side; then
+    those left over try again.
+    """
+    height, width = number.shape
+    link = np.full((len(cells), 2), -1, dtype=np.int32)
+    best = np.empty((len(cells), 2), dtype=np.int32)
+    for attempt in range(tries):
+        best[:] = -1
+        for k in range(len(cells)):
+            i, j = cells[k]
+            if link[k, 0] >= 0 and link[k, 1] >= 0:
+                continue
+            window = _window(maps[2, i, j], attempt)
+            cost = np.full(2, np.inf)
+            for a in range(max(i - window, 0), min(i + window + 1, height)):
+                for b in range(max(j - window, 0), min(j + window + 1, width)):
+                    n = number[a, b]
+                    if n < 0 or n == k or n == link[k, 0] or n == link[k, 1]:
+                        continue
+                    price = _price(maps, cells[k], cells[n], window, gate)
+                    side = 1 if price > 0 else 0
+                    if abs(price) >= cost[side] or link[k, side] >= 0:
+                        continue
+                    back = 1 if _price(maps, cells[n], cells[k], 99.0, gate) > 0 else 0
+                    if link[n, back] < 0:
+                        cost[side], best[k, side] = abs(price), n
+        for k in range(len(cells)):
+            for side in range(2):
+                n = best[k, side]
+                if n < 0:
+                    continue
+                for back in range(2):
+                    if best[n, back] == k and link[n, back] < 0 and link[k, side] < 0:
+                        link[k, side], link[n, back] = n, k
+    return link
+
+
+@njit(cache=True, nogil=True)
+def chains(link: I32) -> tuple[I32, I64]:
+    """Return the cells in the order of their chains, and where each chain starts and ends.
+
+    A chain is a path; a ring is opened at its first cell.
+    """
+    count = len(link)
+    order, starts = np.empty(count, dtype=np.int32), [np.int64(0)]
+    seen = np.zeros(count, dtype=np.bool_)
+    filled = 0
+    for rings in (False, True):
+        for first in range(count):
+            degree = (link[first, 0] >= 0) + (link[first, 1] >= 0)
+            if seen[first] or (degree == 2 and not rings):
+                continue
+            here = first
+            while here >= 0:
+                seen[here] = True
+                order[filled] = here
+                filled += 1
+                a, b = link[here, 0], link[here, 1]
+                if a >= 0 and not seen[a]:
+                    here = a
+                elif b >= 0 and not seen[b]:
+                    here = b
+                else:
+                    here = -1
+            starts.append(filled)
+    return order, np.array(starts)
+
+
+@njit(cache=True)
+def _bend(path: I32, radius: float, rule: F64) -> int:
+    """Return which cell of a path lies farthest off its chord if that is a bend, else -1.
+
+    rule: least offset, share of the length, share of the radius.
+    """
+    last = len(path) - 1
+    if last < 4:
+        return -1
+    du, dv = path[last, 1] - path[0, 1], path[last, 0] - path[0, 0]
+    length = np.sqrt(du * du + dv * dv) + 1e-9
+    worst, where = max(rule[0], rule[1] * length, rule[2] * radius), -1
+    for k in range(2, last - 1):
+        away = abs((path[k, 1] - path[0, 1]) * dv - (path[k, 0] - path[0, 0]) * du) / length
+        if away > worst:
+            worst, where = away, k
+    return where
+
+
+@njit(cache=True, nogil=True)
+def straight_pieces(
+    cells: I32, starts: I64, log_radius: F32, rule: F64, least_cells: float
+) -> I64:
+    """Cut chains where they bend; return (M, 2) begin and end of the pieces long enough.
+
+    cells: (N, 2) in the order of their chains. rule: see `_bend`.
+    """
+    pieces = [(np.int64(0), np.int64(0))]
+    stack = [(np.int64(0), np.int64(0))]
+    pieces.pop()
+    stack.pop()
+    for chain in range(len(starts) - 1):
+        stack.append((starts[chain], starts[chain + 1]))
+        while len(stack) > 0:
+            begin, end = stack.pop()
+            path = cells[begin:end]
+            du, dv = path[-1, 1] - path[0, 1], path[-1, 0] - path[0, 0]
+            if np.sqrt(du * du + dv * dv) < least_cells:
+                continue
+            mean = 0.0
+            for k in range(len(path)):
+                mean += log_radius[path[k, 0], path[k, 1]]
+            cut = _bend(path, np.exp(mean / len(path)), rule)
+            if cut < 0:
+                pieces.append((begin, end))
+            else:
+                stack.append((begin + cut, end))
+                stack.append((begin, begin + cut))
+    out = np.empty((len(pieces), 2), dtype=np.int64)
+    for k in range(len(pieces)):
+        out[k, 0], out[k, 1] = pieces[k]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def painted(cells: I32, pieces: I64, log_radius: F32, label: I32) -> int:
+    """Number pieces in `label` (h, w) in the order given; return how many.
+
+    A piece most of which runs beside an earlier one, closer than half a radius, is its double and
+    is left out.
+    """
+    height, width = label.shape
+    taken = np.zeros(label.shape, dtype=np.bool_)
+    label[:] = 0
+    found = 0
+    for begin, end in pieces:
+        double = 0
+        for k in range(begin, end):
+            double += taken[cells[k, 0], cells[k, 1]]
+        if 2 * double > end - begin:
+            continue
+        found += 1
+        for k in range(begin, end):
+            i, j = cells[k]
+            if not taken[i, j]:
+                label[i, j] = found
+        for k in range(begin, end):
+            i, j = cells[k]
+            near = max(0.5 * np.exp(log_radius[i, j]), 1.5)
+            reach = int(near)
+            for a in range(max(i - reach, 0), min(i + reach + 1, height)):
+                for b in range(max(j - reach, 0), min(j + reach + 1, width)):
+                    if (a - i) ** 2 + (b - j) ** 2 <= near * near:
+                        taken[a, b] = True
+    return found
+
+
+@njit(cache=True, nogil=True)
+def grown(label: I32, inside: Bool, log_radius: F32, reach: float) -> None:
+    """Let regions grow over inside cells, nearest first, up to `reach` radii from where they were.
+
+    label: (h, w), changed in place. The radius is that of the cell grown from.
+    """
+    height, width = label.shape
+    queue = np.empty((label.size, 4), dtype=np.int32)
+    end = 0
+    for i in range(height):
+        for j in range(width):
+            if label[i, j] > 0:
+                queue[end, 0], queue[end, 1], queue[end, 2], queue[end, 3] = i, j, i, j
+                end += 1
+    begin = 0
+    while begin < end:
+        i, j = np.int64(queue[begin, 0]), np.int64(queue[begin, 1])
+        y, x = np.int64(queue[begin, 2]), np.int64(queue[begin, 3])
+        begin += 1
+        far = (reach * np.exp(log_radius[y, x]) + 1.0) ** 2
+        for a, b in ((i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):
+            if a < 0 or b < 0 or a >= height or b >= width:
+                continue
+            if label[a, b] > 0 or not inside[a, b] or (a - y) ** 2 + (b - x) ** 2 > far:
+                continue
+            label[a, b] = label[i, j]
+            queue[end, 0], queue[end, 1], queue[end, 2], queue[end, 3] = a, b, y, x
+            end += 1

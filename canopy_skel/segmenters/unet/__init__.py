@@ -1,0 +1,7 @@
+"""The learned segmenter. Only `network`, `loss`, `weights` and `segmenter` need torch."""
+
+import os
+
+# Threads of a team that wait must sleep, not spin: arm, bus and mapping want the cores. OpenMP
+# reads this once, when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -1,0 +1,152 @@
+"""From the network's maps to instances: slender, straight, disjoint (no boxes, no suppression).
+
+The middle lines of neighbouring branches lie apart even where their masks touch: the
+middle-line map is thinned, chained along the direction field, cut where it bends, and grown to
+full width.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit
+
+from canopy_skel.frame import Float32Array
+from canopy_skel.geometry import FloatArray
+from canopy_skel.kernels import strands
+from canopy_skel.segmenters.unet.targets import STRIDE
+
+_TRIES = 5
+FEATURES = ("branch", "centre", "direction", "fill", "log_length", "log_radius")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Grouping:
+    """How maps become instances; lengths in pixels of the picture.
+
+    branch, centre: least probability of a cell on a branch, on a middle line. gate_deg: largest
+    turn, ratio: largest logarithmic step of the radius from cell to cell. bend_*: a strand is cut
+    where it leaves its chord by more than each of these. reach: how many radii it grows from its
+    middle.
+    """
+
+    branch: float = 0.3
+    centre: float = 0.05
+    gate_deg: float = 14.0
+    ratio: float = 0.6
+    bend_px: float = 2.0
+    bend_share: float = 0.1
+    bend_radii: float = 0.5
+    reach: float = 1.3
+    least_pixels: int = 100
+    least_length_px: float = 20.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Strands:
+    """Instances on the network's grid.
+
+    label: (h, w) int32, 0 = none. features: (N, len(FEATURES)) of instance i at i - 1: mean
+    probabilities of branch and middle line, agreement of direction, area over that of a strip of
+    the length and radius, logarithms of length and radius in pixels. surplus: (h, w), how far
+    the branch logit is above the threshold.
+    """
+
+    label: strands.I32
+    surplus: Float32Array
+    features: FloatArray
+
+
+def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
+    """Group (5, h, w) maps: logits of branch and centre, cos 2θ, sin 2θ, log radius in pixels."""
+    log_cell = np.float32(np.log(STRIDE))
+    inside = maps[0] > _logit(grouping.branch)
+    smooth = np.zeros_like(maps[1:])
+    strands.smoothed(inside, maps[1:], smooth)
+    centre, field = smooth[0], smooth[1:]
+    field[2] -= log_cell
+    core = inside & (centre > _logit(grouping.centre))
+    core[[0, -1]], core[:, [0, -1]] = False, False
+    cells = strands.thinned(core)
+    number = np.full(inside.shape, -1, dtype=np.int32)
+    number[cells[:, 0], cells[:, 1]] = np.arange(len(cells))
+    gate = np.array([np.cos(2 * np.radians(grouping.gate_deg)), grouping.ratio])
+    order, starts = strands.chains(strands.links(number, cells, field, gate, _TRIES))
+    cells = cells[order]
+    rule = np.array([grouping.bend_px / STRIDE, grouping.bend_share, grouping.bend_radii])
+    least = 0.6 * grouping.least_length_px / STRIDE
+    pieces = strands.straight_pieces(cells, starts, field[2], rule, least)
+    longest_first = np.argsort(pieces[:, 0] - pieces[:, 1], kind="stable")
+    label = np.empty(inside.shape, dtype=np.int32)
+    count = strands.painted(cells, pieces[longest_first], field[2], label)
+    strands.grown(label, inside, field[2], grouping.reach)
+    return _kept(label, count, maps, field[2], grouping)
+
+
+def _logit(probability: float) -> float:
+    return float(np.log(probability / (1 - probability)))
+
+
+def _kept(
+    label: strands.I32, count: int, maps: Float32Array, log_radius: Float32Array, grouping: Grouping
+) -> Strands:
+    """Measure the strands and keep those large enough."""
+    rows, columns = np.nonzero(label)
+    own = label[rows, columns] - 1
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.bincount(own, values, count) / cells
+
+    cells = np.maximum(np.bincount(own, minlength=count), 1)
+    length = STRIDE * _lengths(rows, columns, own, cells)
+    radius = STRIDE * np.exp(mean(log_radius[rows, columns]))
+    pixels = STRIDE**2 * cells
+    wanted = (pixels >= grouping.least_pixels) & (length >= grouping.least_length_px)
+    wanted &= length > 1.2 * pixels / length
+    features = np.column_stack(
+        [
+            mean(expit(maps[0, rows, columns])),
+            mean(expit(maps[1, rows, columns])),
+            np.hypot(mean(maps[2, rows, columns]), mean(maps[3, rows, columns])),
+            np.minimum(pixels / (2 * radius * length), 2.0),
+            np.log(np.maximum(length, 1.0)),
+            np.log(radius),
+        ]
+    )
+    number = np.zeros(count + 1, dtype=np.int32)
+    number[1:][wanted] = np.arange(1, int(wanted.sum()) + 1)
+    return Strands(
+        label=number[label],
+        surplus=maps[0] - np.float32(_logit(grouping.branch)),
+        features=features[wanted],
+    )
+
+
+def _lengths(
+    rows: np.ndarray, columns: np.ndarray, own: np.ndarray, cells: np.ndarray
+) -> FloatArray:
+    """Return the (N,) lengths of strands in cells: that of a strip with the same second moment."""
+    u, v = columns.astype(np.float64), rows.astype(np.float64)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.bincount(own, values, len(cells)) / cells
+
+    centre_u, centre_v = mean(u)[own], mean(v)[own]
+    uu, vv = mean((u - centre_u) ** 2), mean((v - centre_v) ** 2)
+    uv = mean((u - centre_u) * (v - centre_v))
+    largest = 0.5 * (uu + vv) + np.sqrt(0.25 * (uu - vv) ** 2 + uv**2)
+    return np.asarray(np.sqrt(12 * largest + 1))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Calibration:
+    """From features to the probability that an instance is a branch: a logistic regression.
+
+    weights: one per name of `FEATURES`.
+    """
+
+    weights: tuple[float, ...]
+    bias: float
+
+    def scores(self, features: FloatArray) -> FloatArray:
+        """Return (N,) scores in (0, 1)."""
+        return np.asarray(expit(features @ np.array(self.weights) + self.bias))

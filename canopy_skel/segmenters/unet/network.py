@@ -1,0 +1,95 @@
+"""The network: a small U-Net whose highest level works at a quarter of the picture's size.
+
+Five maps at half size: branch, middle line (both logits), cos 2θ, sin 2θ, log radius.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from canopy_skel.frame import UInt8Array
+
+CHANNELS = (16, 32, 64, 128, 192)
+"""At 1/2, 1/4, 1/8, 1/16 and 1/32 of the picture's size: 1.8 million parameters."""
+MULTIPLE_PX = 32
+"""Pictures must be a multiple of this in height and width."""
+_MEAN, _SCALE = 0.45, 0.25
+
+
+class Maps(NamedTuple):
+    """What the network says of every second pixel, each (N, H / 2, W / 2).
+
+    branch, centre: logits. cosine, sine: of twice the direction's angle (u right, v down).
+    log_radius: natural logarithm of the radius in pixels.
+    """
+
+    branch: Tensor
+    centre: Tensor
+    cosine: Tensor
+    sine: Tensor
+    log_radius: Tensor
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, channels)
+        self.second = nn.Sequential(
+            nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.second(self.first(x)))
+
+
+def _convolution(inner: int, outer: int, size: int = 3, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inner, outer, size, stride, size // 2, bias=False),
+        nn.BatchNorm2d(outer),
+        nn.ReLU(),
+    )
+
+
+class UNet(nn.Module):
+    """Encoder and decoder with one residual block per level, skips added."""
+
+    def __init__(self, channels: Sequence[int] = CHANNELS) -> None:
+        super().__init__()
+        pairs = list(zip(channels, channels[1:], strict=False))
+        self.stem = _convolution(3, channels[0], size=5, stride=2)
+        self.down = nn.ModuleList(_convolution(a, b, stride=2) for a, b in pairs)
+        self.encode = nn.ModuleList(_Residual(c) for c in channels[1:])
+        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        self.decode = nn.ModuleList(_Residual(c) for c in channels[:-1])
+        self.head = nn.Conv2d(channels[0], len(Maps._fields), 1)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Return (N, 5, H / 2, W / 2) of `normalised` (N, 3, H, W) pictures; see `Maps`."""
+        x = self.stem(pictures)
+        skips = [x]
+        for down, encode in zip(self.down, self.encode, strict=True):
+            x = encode(down(x))
+            skips.append(x)
+        for level in reversed(range(len(self.narrow))):
+            up = functional.interpolate(self.narrow[level](x), scale_factor=2.0, mode="nearest")
+            x = self.decode[level](up + skips[level])
+        result: Tensor = self.head(x)
+        return result
+
+
+def maps_of(output: Tensor) -> Maps:
+    """Split the network's (N, 5, h, w) output."""
+    return Maps(*output.float().unbind(dim=1))
+
+
+def normalised(pictures_rgb: UInt8Array) -> Tensor:
+    """Return (N, 3, H, W) float32, channels last, of (N, H, W, 3) uint8 pictures."""
+    return scaled(torch.from_numpy(pictures_rgb).permute(0, 3, 1, 2).float())
+
+
+def scaled(pictures_rgb: Tensor) -> Tensor:
+    """Return (N, 3, H, W) pictures of 0 to 255 as the network wants them."""
+    return (pictures_rgb / 255.0 - _MEAN) / _SCALE

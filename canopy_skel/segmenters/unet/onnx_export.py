@@ -1,0 +1,69 @@
+"""The network for runtimes that do not have torch: ONNX, pictures in, the five maps out."""
+
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from canopy_skel.errors import UsageError
+from canopy_skel.segmenters.unet.network import MULTIPLE_PX, UNet, scaled
+from canopy_skel.segmenters.unet.weights import Model, fused
+
+OPSET = 17
+INPUT, OUTPUT = "pictures_rgb", "maps"
+
+
+class _Whole(nn.Module):
+    """The network with the scaling of pictures before it."""
+
+    def __init__(self, network: UNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, pictures_rgb: Tensor) -> Tensor:
+        result: Tensor = self.network(scaled(pictures_rgb))
+        return result
+
+
+def export_onnx(model: Model, path: Path) -> None:
+    """Write the network as ONNX, opset 17, batch, height and width free.
+
+    Input `pictures_rgb`: (N, 3, H, W) float32, 0 to 255, H and W multiples of 32 (continue the
+    edge). Output `maps`: (N, 5, H / 2, W / 2), see `network.Maps`; what groups them into instances
+    is not part of it.
+
+    Raises:
+        UsageError: the package onnx is not installed, or the file cannot be written.
+    """
+    network = _Whole(fused(_copied(model)))
+    example = torch.zeros(1, 3, 2 * MULTIPLE_PX, 2 * MULTIPLE_PX)
+    free = {0: "count", 2: "height", 3: "width"}
+    try:
+        with warnings.catch_warnings():
+            # The exporter without further packages is the older one, and says so.
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                network,
+                (example,),
+                str(path),
+                input_names=[INPUT],
+                output_names=[OUTPUT],
+                dynamic_axes={INPUT: free, OUTPUT: free},
+                opset_version=OPSET,
+                dynamo=False,
+            )
+    except ImportError as error:
+        raise UsageError(
+            f"ONNX needs the extra `onnx`: pip install 'canopy-skel[onnx]' ({error})"
+        ) from error
+    except OSError as error:
+        raise UsageError(
+            f"{path}: cannot be written ({error.strerror}); check the folder"
+        ) from error
+
+
+def _copied(model: Model) -> UNet:
+    network = UNet(model.channels)
+    network.load_state_dict(model.network.state_dict())
+    return network.eval()

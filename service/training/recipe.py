@@ -1,0 +1,158 @@
+"""The recipe of the built-in weights: draw, train, choose, calibrate, describe."""
+
+import hashlib
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from canopy_skel.errors import UsageError
+from canopy_skel.frame import Float32Array
+from canopy_skel.segmenters.labels import LabelledImage, without_small
+from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.network import UNet
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+from canopy_skel.segmenters.unet.weights import Model, save
+from service.training import builtin
+from service.training.judging import Sighting, calibrated, figures, sight, threshold
+from service.training.look import Look
+from service.training.loop import Plan, Run, resume, start, train
+from service.training.store import StoredImages
+
+WANTED_PRECISION = 0.87
+_CANDIDATES = 5
+UNCALIBRATED = Calibration(weights=(4.0, 2.0, 2.0, 0.0, 0.3, 0.0), bias=-6.0)
+BUILTIN_PLAN = Plan(steps=8000)
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Halves:
+    """A validation set in two: one to choose and calibrate on, one to report."""
+
+    choose: Sequence[LabelledImage]
+    report: Sequence[LabelledImage]
+
+
+def halves_of(images: StoredImages) -> Halves:
+    """Split by scene, not by picture: the names start with the scene's number."""
+    own = [(name, without_small(images[k])) for k, name in enumerate(images.names)]
+    scenes = sorted({name.split("-")[0] for name, _ in own})
+    first = set(scenes[: len(scenes) // 2])
+    return Halves(
+        choose=[image for name, image in own if name.split("-")[0] in first],
+        report=[image for name, image in own if name.split("-")[0] not in first],
+    )
+
+
+def builtin_weights(
+    folder: Path, output: Path, plan: Plan, amounts: builtin.Amounts, progress: Progress
+) -> dict[str, Any]:
+    """Make the built-in weights in `folder`, going on where it was left; return what they are.
+
+    Raises:
+        UsageError: a folder cannot be written, or holds a run of another plan.
+    """
+    builtin.draw(folder / "data", amounts, progress)
+    run = resume(plan, folder / "run") or start(plan)
+    validate = StoredImages(folder / "data" / "validate")
+    pictures = StoredImages(folder / "data" / "train")
+    train(run, lambda: pictures, folder / "run", Look(validate, halves_of_names(validate)))
+    model, facts = finish(run, folder / "run", halves_of(validate))
+    facts["training"] |= {"pictures": len(pictures), "data": digest(pictures)}
+    save(output, model, facts)
+    return facts
+
+
+def halves_of_names(images: StoredImages) -> list[int]:
+    """Return the pictures of the choosing half that are looked at during training."""
+    scenes = sorted({name.split("-")[0] for name in images.names})
+    first = set(scenes[: len(scenes) // 2])
+    chosen = [k for k, name in enumerate(images.names) if name.split("-")[0] in first]
+    return chosen[::2]
+
+
+def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any]]:
+    """Choose among the last averages of a run by line-AP, calibrate, and measure.
+
+    Raises:
+        UsageError: the folder holds no averaged weights.
+    """
+    paths = sorted(folder.glob("average-*.pt"))[-_CANDIDATES:]
+    if not paths:
+        raise UsageError(f"{folder}: holds no averaged weights; train first")
+    candidates = [_candidate(path, run.plan.channels, halves.choose) for path in paths]
+    model, chosen = max(candidates, key=lambda pair: figures(pair[1], 0.0)["line_ap"])
+    calibration = calibrated(chosen)
+    least = threshold([s.judged for s in _scored(chosen, calibration)], WANTED_PRECISION)
+    model = replace(model, calibration=calibration, least_score=least)
+    facts = {
+        "validation": {
+            "kind": "synthetic, of a species, bark and backgrounds no training picture has",
+            "chosen_on": _rounded(figures(_again(model, halves.choose), least)),
+            "reported": _rounded(figures(_again(model, halves.report), least)),
+        },
+        "training": {
+            "plan": asdict(run.plan),
+            "steps": run.step,
+            "minutes": round(run.seconds / 60, 1),
+            "torch": torch.__version__,
+            "machine": platform.processor() or platform.machine(),
+        },
+    }
+    return model, facts
+
+
+def _candidate(
+    path: Path, channels: tuple[int, ...], images: Sequence[LabelledImage]
+) -> tuple[Model, list[Sighting]]:
+    network = UNet(channels)
+    network.load_state_dict(torch.load(path, weights_only=True))
+    model = Model(
+        network=network.eval(),
+        channels=channels,
+        grouping=Grouping(),
+        calibration=UNCALIBRATED,
+        least_score=0.0,
+    )
+    return model, _again(model, images)
+
+
+def _again(model: Model, images: Sequence[LabelledImage]) -> list[Sighting]:
+    segmenter = UNetSegmenter(model)
+    return [
+        sight(
+            segmenter.maps(image.color_rgb),
+            image,
+            model.grouping,
+            model.calibration,
+            model.least_score,
+        )
+        for image in images
+    ]
+
+
+def _scored(sightings: Sequence[Sighting], calibration: Calibration) -> list[Sighting]:
+    return [
+        replace(s, judged=replace(s.judged, scores=calibration.scores(s.features)))
+        for s in sightings
+    ]
+
+
+def _rounded(values: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 4) for name, value in values.items()}
+
+
+def digest(images: StoredImages) -> str:
+    """Return a SHA-256 over all pictures and target maps, which says what was trained on."""
+    total = hashlib.sha256()
+    for k, name in enumerate(images.names):
+        total.update(name.encode())
+        total.update(np.ascontiguousarray(images.color(k)))
+        total.update(np.ascontiguousarray(images.maps(k)))
+    return total.hexdigest()

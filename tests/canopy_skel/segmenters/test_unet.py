@@ -1,0 +1,160 @@
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from contracts.segmenter import SegmenterContract
+from scenes.drawn import drawn, straight
+from scenes.views import view_of
+
+from canopy_skel.errors import UsageError, ViewError
+from canopy_skel.segmenters.unet import segmenter as module
+from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.network import UNet
+from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+from canopy_skel.segmenters.unet.weights import BUILTIN, Model, load
+
+TORCH_FREE = """
+import sys
+import canopy_skel.pipeline, canopy_skel.recording, canopy_skel.segmenters.recorded
+import canopy_skel.segmenters.labels, canopy_skel.segmenters.unet.grouping
+import canopy_skel.segmenters.unet.targets, canopy_skel.metrics.instances
+import service.cli, service.replay, service.worker, service.compose, service.skeletons
+service.skeletons.SEGMENTERS["recorded"]()
+print("torch" in sys.modules)
+"""
+
+
+@pytest.fixture(scope="module")
+def untrained():
+    torch.manual_seed(4)
+    channels = (8, 8, 8)
+    return Model(
+        network=UNet(channels).eval(),
+        channels=channels,
+        grouping=Grouping(),
+        calibration=Calibration(weights=(0.0,) * 6, bias=0.0),
+        least_score=0.0,
+    )
+
+
+def noise(height, width):
+    return np.random.default_rng(1).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+@pytest.mark.skipif(not BUILTIN.exists(), reason="the built-in weights are not there")
+class TestUNetSegmenter(SegmenterContract):
+    @pytest.fixture(scope="class")
+    def segmenter(self):
+        return UNetSegmenter(load())
+
+    @pytest.fixture
+    def view_with_branches(self):
+        lines = [straight((160, 240), 80, 400, 14), straight((430, 220), 130, 380, 9)]
+        return view_of(drawn(lines, (480, 640)).color_rgb)
+
+    @pytest.fixture
+    def empty_view(self):
+        return view_of(np.full((200, 300, 3), 180, np.uint8))
+
+
+def test_only_the_learned_segmenter_loads_torch():
+    done = subprocess.run(
+        [sys.executable, "-c", TORCH_FREE], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 500), (97, 131), (64, 64)])
+def test_pictures_of_any_size_get_maps_of_half_of_it(untrained, size):
+    maps = UNetSegmenter(untrained).maps(noise(*size))
+    assert maps.shape == (5, -(-size[0] // 2), -(-size[1] // 2))
+    assert np.isfinite(maps).all()
+
+
+def test_tiles_fit_together_without_a_seam(untrained):
+    picture = noise(500, 700)
+    whole = UNetSegmenter(untrained).maps(picture)
+    tiled = UNetSegmenter(untrained, tile_px=320).maps(picture)
+    assert np.allclose(whole, tiled, atol=1e-4)
+
+
+def test_where_memory_runs_out_tiles_are_made_smaller(untrained, monkeypatch):
+    picture = noise(300, 1300)
+    segmenter = UNetSegmenter(untrained)
+    whole = segmenter.maps(picture)
+    infer = UNetSegmenter._infer
+    seen = []
+
+    def scarce(self, color):
+        seen.append(color.shape[1])
+        if color.shape[1] > 800:
+            raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 9 bytes")
+        return infer(self, color)
+
+    monkeypatch.setattr(UNetSegmenter, "_infer", scarce)
+    assert np.allclose(segmenter.maps(picture), whole, atol=1e-4)
+    assert max(seen) > 800
+    assert min(seen) <= 768
+
+
+def test_where_no_memory_is_left_at_all_the_view_is_refused(untrained, monkeypatch):
+    def none_left(self, color):
+        raise MemoryError
+
+    monkeypatch.setattr(UNetSegmenter, "_infer", none_left)
+    with pytest.raises(ViewError, match="view 3: no memory left for a picture of 80x60"):
+        UNetSegmenter(untrained).segment(view_of(noise(60, 80)))
+
+
+def test_other_errors_are_not_taken_for_lack_of_memory(untrained, monkeypatch):
+    def broken(self, color):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(UNetSegmenter, "_infer", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        UNetSegmenter(untrained).maps(noise(60, 80))
+
+
+@pytest.mark.parametrize(
+    "color", [np.zeros((40, 60, 3), np.uint16), np.zeros((40, 60), np.uint8)]
+)
+def test_pictures_that_are_not_8_bit_colour_are_refused(untrained, color):
+    with pytest.raises(ViewError, match=r"needs \(H, W, 3\) uint8"):
+        UNetSegmenter(untrained).segment(view_of(color))
+
+
+def test_instances_below_the_least_score_are_not_reported(untrained):
+    view = view_of(noise(200, 300))
+    loose = replace(untrained, grouping=Grouping(least_pixels=8, least_length_px=2))
+    assert len(UNetSegmenter(loose).segment(view)) > 0
+    assert UNetSegmenter(replace(loose, least_score=0.6)).segment(view) == []
+
+
+def test_the_number_of_threads_is_bounded(untrained):
+    UNetSegmenter(untrained)
+    assert torch.get_num_threads() == 1
+
+
+@pytest.mark.skipif(not has_fast_bfloat16(), reason="this CPU has no bfloat16 arithmetic")
+def test_bfloat16_says_nearly_the_same(untrained):
+    picture = noise(200, 300)
+    exact = UNetSegmenter(untrained).maps(picture)
+    rough = UNetSegmenter(untrained, bfloat16=True).maps(picture)
+    assert np.abs(exact - rough).mean() < 0.05 * np.abs(exact).mean()
+    assert not np.array_equal(exact, rough)
+
+
+def test_bfloat16_is_refused_where_the_cpu_lacks_it(untrained, monkeypatch):
+    monkeypatch.setattr(module, "has_fast_bfloat16", lambda: False)
+    with pytest.raises(UsageError, match="no bfloat16"):
+        UNetSegmenter(untrained, bfloat16=True)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_that_is_not_there_is_named(untrained):
+    with pytest.raises(UsageError, match="torch finds no device 'cuda:0'"):
+        UNetSegmenter(untrained, device="cuda:0")

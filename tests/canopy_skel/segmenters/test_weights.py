@@ -1,0 +1,131 @@
+import hashlib
+import json
+import pickle
+
+import pytest
+import torch
+
+from canopy_skel.errors import UsageError
+from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.network import UNet, normalised
+from canopy_skel.segmenters.unet.weights import BUILTIN, Model, fused, load, save
+
+SMALL = (4, 6, 8)
+
+
+@pytest.fixture
+def model():
+    torch.manual_seed(0)
+    return Model(
+        network=UNet(SMALL).eval(),
+        channels=SMALL,
+        grouping=Grouping(branch=0.6),
+        calibration=Calibration(weights=(1.0, 2.0, 3.0, 0.0, 0.5, -0.5), bias=-2.0),
+        least_score=0.3,
+    )
+
+
+@pytest.fixture
+def saved(model, tmp_path):
+    path = tmp_path / "mine.pt"
+    save(path, model, {"note": "of a test"})
+    return path
+
+
+def described(path, **changes):
+    beside = path.with_suffix(".json")
+    beside.write_text(json.dumps(json.loads(beside.read_text()) | changes))
+
+
+def rehash(path):
+    described(path, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def test_what_was_saved_is_loaded(model, saved):
+    again = load(saved)
+    assert again.grouping == model.grouping
+    assert again.calibration == model.calibration
+    assert (again.channels, again.least_score) == (SMALL, 0.3)
+    wanted = model.network.state_dict()
+    for name, value in again.network.state_dict().items():
+        assert value.dtype == wanted[name].dtype
+        assert torch.allclose(value, wanted[name], rtol=1e-3, atol=1e-6)
+    assert json.loads(saved.with_suffix(".json").read_text())["note"] == "of a test"
+
+
+def test_a_truncated_file_is_refused_before_it_is_unpickled(saved):
+    saved.write_bytes(saved.read_bytes()[:-100])
+    with pytest.raises(UsageError, match=r"mine\.pt: is not the file its JSON describes"):
+        load(saved)
+
+
+class Harmful:
+    def __reduce__(self):
+        return (pytest.fail, ("code in a weights file was run",))
+
+
+def test_pickled_code_is_never_run(saved, tmp_path):
+    saved.write_bytes(pickle.dumps(Harmful(), protocol=2))
+    with pytest.raises(UsageError, match="is not the file"):
+        load(saved)
+    rehash(saved)
+    with pytest.raises(UsageError, match="something other than plain weights"):
+        load(saved)
+    torch.save({"stem.0.weight": Harmful()}, saved)
+    rehash(saved)
+    with pytest.raises(UsageError, match="something other than plain weights"):
+        load(saved)
+
+
+def test_weights_of_another_architecture_are_refused(saved):
+    described(saved, channels=[4, 6, 10])
+    with pytest.raises(UsageError, match=r"another architecture: .*expected"):
+        load(saved)
+    torch.save([1, 2], saved)
+    rehash(saved)
+    with pytest.raises(UsageError, match="another architecture"):
+        load(saved)
+
+
+def test_a_description_that_is_missing_old_or_short_is_named(saved):
+    beside = saved.with_suffix(".json")
+    text = beside.read_text()
+    for wrong, why in (
+        ("{", "is not JSON"),
+        ('{"format": "canopy-unet/0"}', "of format 'canopy-unet/0'"),
+        ("[]", "of format None"),
+    ):
+        beside.write_text(wrong)
+        with pytest.raises(UsageError, match=why):
+            load(saved)
+    beside.write_text(json.dumps({k: v for k, v in json.loads(text).items() if k != "grouping"}))
+    with pytest.raises(UsageError, match="lacks grouping"):
+        load(saved)
+    beside.unlink()
+    with pytest.raises(UsageError, match=r"mine\.json: cannot be read"):
+        load(saved)
+
+
+def test_folding_normalisation_into_convolutions_changes_nothing(model):
+    network = model.network.train()
+    pictures = torch.rand(2, 3, 64, 64)
+    for _ in range(3):
+        network(pictures)
+    network.eval()
+    with torch.inference_mode():
+        wanted = network(pictures)
+        assert torch.allclose(fused(network)(pictures), wanted, atol=1e-4)
+
+
+def test_the_network_answers_at_half_size():
+    with torch.inference_mode():
+        out = UNet().eval()(normalised(torch.zeros(1, 64, 96, 3, dtype=torch.uint8).numpy()))
+    assert out.shape == (1, 5, 32, 48)
+
+
+@pytest.mark.skipif(not BUILTIN.exists(), reason="the built-in weights are not there")
+def test_the_built_in_weights_are_small_and_say_where_they_come_from():
+    assert BUILTIN.stat().st_size <= 8 << 20
+    assert sum(value.numel() for value in load().network.parameters()) <= 3_000_000
+    facts = json.loads(BUILTIN.with_suffix(".json").read_text())
+    assert {"training", "validation", "sha256"} <= facts.keys()
