@@ -11,12 +11,11 @@ from typing import Self
 import numpy as np
 
 from canopy_skel.document import SkeletonDocument
-from canopy_skel.errors import UsageError
 from canopy_skel.frame import Intrinsics
 from canopy_skel.geometry import FloatArray, invert
 from drivers.errors import CameraTimeoutError, NoCameraError
 from drivers.protocols import CameraImage, ToolPose
-from mock_hw.orchard.camera import Camera, Shot, shoot
+from mock_hw.orchard.camera import Shot, scaled, shoot
 from mock_hw.orchard.foliage import framed
 from mock_hw.orchard.path import TOOL_FROM_CAMERA
 from mock_hw.orchard.pose_noise import pose_noise_named, small_transform
@@ -149,31 +148,6 @@ class SimCamera:
             Exposure(stamp_ns=pose.stamp_ns, base_from_camera=base_from_camera, seen=seen)
         )
         return _image(shot)
-
-
-def scaled(camera: Camera, scale: float) -> Camera:
-    """Return the camera with pictures of another size that show the same.
-
-    Raises:
-        UsageError: the scale leaves no picture.
-    """
-    one = camera.intrinsics
-    width_px, height_px = round(scale * one.width_px), round(scale * one.height_px)
-    if width_px < 1 or height_px < 1:
-        raise UsageError(f"a camera scaled by {scale} has no pixels; give more than 0, up to 1")
-    across, down = width_px / one.width_px, height_px / one.height_px
-    # Pixel centres are at whole numbers, so the picture's corner is at -0.5.
-    return replace(
-        camera,
-        intrinsics=Intrinsics(
-            fx_px=across * one.fx_px,
-            fy_px=down * one.fy_px,
-            cx_px=across * (one.cx_px + 0.5) - 0.5,
-            cy_px=down * (one.cy_px + 0.5) - 0.5,
-            width_px=width_px,
-            height_px=height_px,
-        ),
-    )
 
 
 def _image(shot: Shot) -> CameraImage:

@@ -1,10 +1,11 @@
 """The simulated stereo camera: what it sees of a scene from any pose."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from canopy_skel.errors import UsageError
 from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array, View
 from canopy_skel.geometry import FloatArray, transform_from
 from mock_hw.orchard import renderer
@@ -37,6 +38,31 @@ class Shot:
     view: View
     picture: Picture
     fragments: Fragments
+
+
+def scaled(camera: Camera, scale: float) -> Camera:
+    """Return the camera with pictures of another size that show the same.
+
+    Raises:
+        UsageError: the scale leaves no picture.
+    """
+    one = camera.intrinsics
+    width_px, height_px = round(scale * one.width_px), round(scale * one.height_px)
+    if width_px < 1 or height_px < 1:
+        raise UsageError(f"a camera scaled by {scale} has no pixels; give more than 0, up to 1")
+    across, down = width_px / one.width_px, height_px / one.height_px
+    # Pixel centres are at whole numbers, so the picture's corner is at -0.5.
+    return replace(
+        camera,
+        intrinsics=Intrinsics(
+            fx_px=across * one.fx_px,
+            fy_px=down * one.fy_px,
+            cx_px=across * (one.cx_px + 0.5) - 0.5,
+            cy_px=down * (one.cy_px + 0.5) - 0.5,
+            width_px=width_px,
+            height_px=height_px,
+        ),
+    )
 
 
 def render_view(

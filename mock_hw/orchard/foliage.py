@@ -4,6 +4,7 @@ V_det is the share of the true skeleton (of what any view frames) that lies in s
 enough to be found in one image; see `instances`. Seen "by two pixels" would saturate.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -112,17 +113,20 @@ def canopy_of(
     return Canopy(tree=tree, poses=poses, intrinsics=intrinsics, vertex=vertices, cover=covers)
 
 
-def fit_foliage(tree: Tree, density: int, *, seed: int, trellis: bool) -> FoliageFit:
-    """Find the leaf count of foliage density 1..4 by bisection.
+def fit_foliage(
+    tree: Tree, densities: Sequence[int], *, seed: int, trellis: bool
+) -> tuple[FoliageFit, ...]:
+    """Find the leaf counts of foliage densities 1..4 by bisection; the tree is drawn once for all.
 
     Raises:
         UsageError: there is no such density.
     """
-    if density not in DENSITIES:
-        raise UsageError(f"no foliage density {density}; choose 1, 2, 3 or 4")
+    for density in densities:
+        if density not in DENSITIES:
+            raise UsageError(f"no foliage density {density}; choose 1, 2, 3 or 4")
     most = MOST_LEAVES[tree.species.name]
     canopy = canopy_of(tree, seed=seed, trellis=trellis, most_leaves=most)
-    return fit_canopy(canopy, density, most)
+    return tuple(fit_canopy(canopy, density, most) for density in densities)
 
 
 def fit_canopy(canopy: Canopy, density: int, most_leaves: int) -> FoliageFit:

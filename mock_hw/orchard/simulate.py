@@ -1,6 +1,6 @@
 """A simulated scan: tree, foliage, light, camera, noise; views one by one, and the truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
@@ -10,8 +10,8 @@ from canopy_skel.errors import UsageError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray, invert
 from mock_hw.orchard import renderer
-from mock_hw.orchard.camera import Camera, fragments_in, render_view
-from mock_hw.orchard.foliage import FoliageFit, fit_foliage, framed
+from mock_hw.orchard.camera import Camera, Shot, fragments_in, shoot
+from mock_hw.orchard.foliage import DENSITIES, FoliageFit, fit_foliage, framed
 from mock_hw.orchard.light import any_weather, fair_weather
 from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
 from mock_hw.orchard.pose_noise import PoseNoise, pose_noise_named, small_transform
@@ -19,7 +19,7 @@ from mock_hw.orchard.presets import species_named
 from mock_hw.orchard.scene import Scene, build_scene
 from mock_hw.orchard.species import Species
 from mock_hw.orchard.tree import grow
-from mock_hw.orchard.truth import nothing_seen, seen_also, truth_document
+from mock_hw.orchard.truth import Seen, nothing_seen, seen_also, truth_document
 from mock_hw.orchard.wind import swayed
 
 FIRST_STAMP_NS = 1_760_000_000_000_000_000
@@ -89,13 +89,8 @@ def prepare(options: Options, fit: FoliageFit | None = None) -> Simulation:
     Raises:
         UsageError: an option is unknown or negative.
     """
-    for name in ("topology", "seed", "leaf_count", "wind_m"):
-        value = getattr(options, name)
-        if value is not None and value < 0:
-            raise UsageError(f"{name} is {value}; give 0 or more")
+    require_known(options)
     species = species_named(options.species)
-    if options.weather not in ("fair", "any"):
-        raise UsageError(f"unknown weather {options.weather!r}; choose fair or any")
     noise = pose_noise_named(options.noise)
     true_poses = camera_path(options.views)
     tree = grow(species, options.topology)
@@ -103,7 +98,9 @@ def prepare(options: Options, fit: FoliageFit | None = None) -> Simulation:
     surroundings_seed = options.topology
     leaf_count = options.leaf_count
     if leaf_count is None:
-        fit = fit or fit_foliage(tree, options.foliage, seed=surroundings_seed, trellis=trellis)
+        fit = (
+            fit or fit_foliage(tree, (options.foliage,), seed=surroundings_seed, trellis=trellis)[0]
+        )
         leaf_count = fit.leaf_count
     light = any_weather(_rng(options, 0)) if options.weather == "any" else fair_weather()
     scene = build_scene(
@@ -118,6 +115,35 @@ def prepare(options: Options, fit: FoliageFit | None = None) -> Simulation:
         reported_poses=reported,
         tool_from_camera=tool_from_camera,
     )
+
+
+def require_known(options: Options) -> None:
+    """Check that a scan can be simulated as asked, before any work is done.
+
+    Raises:
+        UsageError: an option is unknown or negative.
+    """
+    for name in ("topology", "seed", "leaf_count", "wind_m"):
+        value = getattr(options, name)
+        if value is not None and value < 0:
+            raise UsageError(f"{name} is {value}; give 0 or more")
+    if options.foliage not in DENSITIES:
+        raise UsageError(f"no foliage density {options.foliage}; choose 1, 2, 3 or 4")
+    if options.weather not in ("fair", "any"):
+        raise UsageError(f"unknown weather {options.weather!r}; choose fair or any")
+    species_named(options.species)
+    pose_noise_named(options.noise)
+    camera_path(options.views)
+
+
+def fit_densities(species: str, topology: int, densities: Sequence[int]) -> tuple[FoliageFit, ...]:
+    """Return the leaf counts of several foliage densities of one tree, which is drawn once.
+
+    Raises:
+        UsageError: there is no such species or density.
+    """
+    kind = species_named(species)
+    return fit_foliage(grow(kind, topology), densities, seed=topology, trellis=trellised(kind))
 
 
 def _reported(
@@ -139,8 +165,14 @@ def trellised(species: Species) -> bool:
 
 def views(simulation: Simulation) -> Iterator[View]:
     """Yield the views of the scan as the method gets them: noisy depth, reported poses."""
+    for shot in shots(simulation):
+        yield shot.view
+
+
+def shots(simulation: Simulation) -> Iterator[Shot]:
+    """Yield the views of the scan, each with what it was made from."""
     for index, pose in enumerate(simulation.true_poses):
-        view = render_view(
+        shot = shoot(
             scene_at(simulation, index),
             pose,
             simulation.options.camera,
@@ -148,7 +180,8 @@ def views(simulation: Simulation) -> Iterator[View]:
             stamp_ns=FIRST_STAMP_NS + index * STEP_NS,
             seed=simulation.options.seed,
         )
-        yield replace(view, base_from_camera=simulation.reported_poses[index])
+        reported = replace(shot.view, base_from_camera=simulation.reported_poses[index])
+        yield replace(shot, view=reported)
 
 
 def truth(simulation: Simulation) -> SkeletonDocument:
@@ -159,6 +192,12 @@ def truth(simulation: Simulation) -> SkeletonDocument:
         scene = scene_at(simulation, index)
         picture = renderer.draw(scene.mesh, pose, intrinsics)
         seen = seen_also(seen, picture.vertex, fragments_in(scene, picture, pose, intrinsics))
+    return truth_of(simulation, seen)
+
+
+def truth_of(simulation: Simulation, seen: Seen) -> SkeletonDocument:
+    """Return the true skeleton, with what all views of this scan were found to show of it."""
+    intrinsics, tree = simulation.options.camera.intrinsics, simulation.scene.tree
     return truth_document(
         tree,
         seen,

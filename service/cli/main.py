@@ -14,6 +14,7 @@ from service.cli.scan import scan
 from service.cli.score import score
 from service.cli.serve import serve, worker
 from service.cli.shell import Exit, complain
+from service.cli.simulate import simulate
 
 app = typer.Typer(
     name="canopy",
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for verb in (replay, inspect, score, recover, export, serve, scan, doctor):
+for verb in (replay, inspect, score, recover, export, serve, scan, simulate, doctor):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)
 

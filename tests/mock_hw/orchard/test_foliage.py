@@ -61,4 +61,4 @@ def test_the_foot_of_the_trunk_is_in_no_frame(apple):
 
 def test_an_unknown_density_is_refused(apple):
     with pytest.raises(UsageError, match="no foliage density 5; choose 1, 2, 3 or 4"):
-        fit_foliage(apple, 5, seed=0, trellis=False)
+        fit_foliage(apple, (5,), seed=0, trellis=False)
