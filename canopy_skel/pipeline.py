@@ -1,7 +1,7 @@
 """Views in, one growing likelihood map, a skeleton out: the whole method in the paper's order."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -9,9 +9,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from canopy_skel.assemble import skeleton_of
 from canopy_skel.baselines.ftsem import FtsemConfig, join_break_points
 from canopy_skel.baselines.mst import join_by_spanning_tree
+from canopy_skel.canopy import CanopyConfig, CanopyScan
 from canopy_skel.cluster import ClusterConfig, RejectedInstance, cluster_branches
+from canopy_skel.confidence import shipped_models
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
@@ -19,10 +22,11 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
 from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
-from canopy_skel.segment import Segmenter
+from canopy_skel.segment import BranchMask, Segmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
+from canopy_skel.wood import wood_of
 
-MethodName = Literal["paper", "mst", "ftsem"]
+MethodName = Literal["canopy", "paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
 LONGEST_WAY_M = 5.0
 """Between a camera and the nearest other one of a scan."""
@@ -36,6 +40,7 @@ class MethodConfig:
     """A method by name and the settings of its stages.
 
     straighten_steps: how often predicted vertices are moved to the mean of their neighbours.
+    Method `canopy` uses `canopy` and `likelihood`, the others everything else.
     """
 
     name: MethodName = "paper"
@@ -45,6 +50,7 @@ class MethodConfig:
     initial: InitialConfig = field(default_factory=InitialConfig)
     ftsem: FtsemConfig = field(default_factory=FtsemConfig)
     straighten_steps: int = 10
+    canopy: CanopyConfig = field(default_factory=CanopyConfig)
 
     def __post_init__(self) -> None:
         """Refuse a method that is not known."""
@@ -53,7 +59,10 @@ class MethodConfig:
 
     def sha256(self) -> str:
         """Return the hash that names this configuration in documents."""
-        return sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+        fields = asdict(self)
+        if self.name != "canopy":
+            del fields["canopy"]
+        return sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -86,6 +95,7 @@ class Skeletonizer:
         self._cameras: dict[int, FloatArray] = {}
         self._instances = 0
         self._rejected: list[RejectedInstance] = []
+        self._canopy = CanopyScan(config.canopy)
 
     @property
     def config(self) -> MethodConfig:
@@ -121,6 +131,8 @@ class Skeletonizer:
         self._check_place(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
+        if self._config.name == "canopy":
+            return self._observe(view, masks)
         with self._stage("cluster"):
             clusters, rejected = cluster_branches(view, masks, self._config.cluster)
         with self._stage("spline"):
@@ -132,6 +144,18 @@ class Skeletonizer:
         self._instances += len(masks)
         self._rejected.extend(rejected)
         return len(splines)
+
+    def _observe(self, view: View, masks: Sequence[BranchMask]) -> int:
+        with self._stage("observe"):
+            seen = self._canopy.observe(view, masks, wood_of(self._segmenter, view))
+        with self._stage("likelihood"):
+            self._map.add(segments_of(seen.splines))
+        with self._stage("evidence"):
+            self._canopy.add(view.index, seen)
+        self._splines[view.index] = seen.splines
+        self._cameras[view.index] = view.base_from_camera[:3, 3]
+        self._instances += len(masks)
+        return len(seen.splines)
 
     def _check_place(self, view: View) -> None:
         """Refuse a view from far away: its pose is wrong, and the map would span the way there."""
@@ -146,6 +170,9 @@ class Skeletonizer:
 
     def skeleton(self) -> Extraction:
         """Return the skeleton of all views so far; it does not depend on their order."""
+        if self._config.name == "canopy":
+            with self._stage("canopy"):
+                return self._canopy_skeleton()
         splines = [spline for index in self.views for spline in self._splines[index]]
         with self._stage("initial"):
             grid = self._map.grid()
@@ -166,4 +193,13 @@ class Skeletonizer:
             voxels=len(grid.voxels),
             observed_components=initial.components()[0],
             joins=tuple(joins),
+        )
+
+    def _canopy_skeleton(self) -> Extraction:
+        joined = skeleton_of(self._canopy, self._map, shipped_models())
+        return Extraction(
+            graph=joined.graph,
+            voxels=self._map.voxel_count(),
+            observed_components=joined.observed_components,
+            joins=(),
         )
