@@ -4,30 +4,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from canopy_skel.baselines.mst import join_by_spanning_tree
 from canopy_skel.canopy import CanopyScan, map_cost
 from canopy_skel.confidence import Models
-from canopy_skel.ends import find_ends
 from canopy_skel.extend import Rays, lengths, rays_of
 from canopy_skel.fusion import Observed
-from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import Candidates, Parts, accepted, candidates_of
+from canopy_skel.poses import PoseCorrection
 
+TAIL_CONFIDENCE = 0.1
+"""Of joins that no evidence supports, made only because one tree was asked for."""
 OBSERVED, FRAGMENT, LINK, EXTENSION = range(4)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Assembled:
-    """The skeleton, and in how many parts wood was observed."""
+    """The skeleton, in how many parts wood was observed, and the views that were moved."""
 
     graph: SkeletonGraph
     observed_components: int
+    corrections: tuple[PoseCorrection, ...]
 
 
 def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> Assembled:
     """Return the skeleton of all views so far."""
-    parts, observed = scan.parts(scan.observed(models), models)
+    fused, corrections = scan.observed(models)
+    parts, observed = scan.parts(fused, models)
     config = scan.config
 
     def cost(points: FloatArray) -> FloatArray:
@@ -50,7 +55,13 @@ def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> 
     graph = with_extensions(
         graph, rays, lengths(rays, steps, config.extensions.min_probability), steps, parts
     )
-    return Assembled(graph=graph, observed_components=int(parts.component.max(initial=-1)) + 1)
+    if config.rooted:
+        graph = with_tail(graph, config.links.spacing_m)
+    return Assembled(
+        graph=graph,
+        observed_components=int(parts.component.max(initial=-1)) + 1,
+        corrections=tuple(corrections),
+    )
 
 
 def free_ends(parts: Parts, candidates: Candidates, made: IntArray) -> IntArray:
@@ -92,7 +103,16 @@ def with_links(
         a, b = int(parts.ends.vertex[candidates.end[i]]), int(candidates.vertex[i])
         radius_m = min(graph.radius_m[a], graph.radius_m[b])
         inner = evenly(candidates.curves[i], spacing_m)[1:-1]
-        chains.append(Chain(start=a, goal=b, points=inner, radius_m=radius_m, confidence=np.full(len(inner), p), source=LINK))
+        chains.append(
+            Chain(
+                start=a,
+                goal=b,
+                points=inner,
+                radius_m=radius_m,
+                confidence=np.full(len(inner), p),
+                source=LINK,
+            )
+        )
     return with_chains(graph, chains)
 
 
@@ -116,6 +136,16 @@ def with_extensions(
     return with_chains(graph, chains)
 
 
+def with_tail(graph: SkeletonGraph, spacing_m: float) -> SkeletonGraph:
+    """Join what is left apart by the shortest straight gaps, with a confidence that warns."""
+    joined = join_by_spanning_tree(replace(graph, source=None), spacing_m)
+    added = len(joined.vertices_in_base) - len(graph.vertices_in_base)
+    confidence = joined.confidence.copy()
+    confidence[len(confidence) - added :] = TAIL_CONFIDENCE
+    source = np.append(sources_of(graph), np.full(added, LINK))
+    return replace(joined, confidence=confidence, source=source)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Chain:
     """New vertices (n, 3) in a row from vertex `start` to `goal` (-1: to nowhere)."""
@@ -130,7 +160,6 @@ class Chain:
 
 def with_chains(graph: SkeletonGraph, chains: list[Chain]) -> SkeletonGraph:
     """Add predicted vertices in rows."""
-    assert graph.source is not None
     count, edges = len(graph.vertices_in_base), [graph.edges]
     for chain in chains:
         row = [chain.start, *range(count, count + len(chain.points))]
@@ -145,8 +174,18 @@ def with_chains(graph: SkeletonGraph, chains: list[Chain]) -> SkeletonGraph:
         radius_m=np.append(graph.radius_m, np.repeat([c.radius_m for c in chains], sizes)),
         occluded=np.append(graph.occluded, np.ones(added, dtype=np.bool_)),
         confidence=np.concatenate([graph.confidence, *(c.confidence for c in chains)]),
-        source=np.append(graph.source, np.repeat([c.source for c in chains], sizes)).astype(np.int64),
+        source=np.append(
+            sources_of(graph),
+            np.repeat(np.array([c.source for c in chains], dtype=np.int64), sizes),
+        ),
     )
+
+
+def sources_of(graph: SkeletonGraph) -> IntArray:
+    """Return how each vertex is known (V,); observed where nobody says."""
+    if graph.source is None:
+        return np.zeros(len(graph.vertices_in_base), dtype=np.int64)
+    return graph.source
 
 
 def evenly(curve: FloatArray, spacing_m: float) -> FloatArray:

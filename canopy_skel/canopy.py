@@ -4,8 +4,9 @@ Everything a view adds is kept per view, and what all views say together is buil
 integers and from arrays in the order of the views' numbers: no order of arrival can show.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -22,6 +23,7 @@ from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
 from canopy_skel.observe import Observation, observe
 from canopy_skel.pieces import PieceConfig
+from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
 from canopy_skel.segment import BranchMask
 from canopy_skel.wood import FragmentConfig
 
@@ -41,12 +43,34 @@ class CanopyConfig:
     pieces: PieceConfig = field(default_factory=PieceConfig)
     fragments: FragmentConfig = field(default_factory=FragmentConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    poses: PoseConfig = field(default_factory=PoseConfig)
     links: LinkConfig = field(default_factory=LinkConfig)
     extensions: ExtensionConfig = field(default_factory=ExtensionConfig)
     use_fragments: bool = True
     min_point: float = 0.5
     min_piece_m: float = 0.01
     rooted: bool = False
+
+
+_STAGES: Mapping[str, type[Any]] = {
+    "pieces": PieceConfig,
+    "fragments": FragmentConfig,
+    "fusion": FusionConfig,
+    "poses": PoseConfig,
+    "links": LinkConfig,
+    "extensions": ExtensionConfig,
+}
+
+
+def canopy_config_from(fields: Mapping[str, Any]) -> CanopyConfig:
+    """Return the settings that `dataclasses.asdict` took apart.
+
+    Raises:
+        KeyError: a stage is missing.
+        TypeError: a field is missing or unknown.
+    """
+    stages = {name: stage(**fields[name]) for name, stage in _STAGES.items()}
+    return CanopyConfig(**{**fields, **stages})
 
 
 class CanopyScan:
@@ -101,24 +125,27 @@ class CanopyScan:
             np.concatenate(features),
         )
 
-    def observed(self, models: Models) -> Observed:
-        """Return the fused forest of what was seen."""
+    def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
+        """Return the fused forest of what was seen, and which views were moved for it."""
         points, directions, radius_m, fragment, bits, features = self.points()
         probability = np.where(
             fragment, models.fragment_point(features), models.instance_point(features)
         )
         kept = probability >= self.config.min_point
-        return fuse(
-            Observations(
-                points_in_base=points[kept],
-                directions=directions[kept],
-                radius_m=radius_m[kept],
-                probability=probability[kept],
-                view_bits=bits[kept],
-                fragment=fragment[kept],
-            ),
-            self.config.fusion,
+        seen = Observations(
+            points_in_base=points[kept],
+            directions=directions[kept],
+            radius_m=radius_m[kept],
+            probability=probability[kept],
+            view_bits=bits[kept],
+            fragment=fragment[kept],
         )
+        fused = fuse(seen, self.config.fusion)
+        corrections = pose_corrections(seen, fused, self.config.poses)
+        if corrections:
+            seen = replace(seen, points_in_base=corrected(seen, corrections))
+            fused = fuse(seen, self.config.fusion)
+        return fused, corrections
 
     def parts(self, observed: Observed, models: Models) -> tuple[Parts, Observed]:
         """Return what is to be joined, without specks, and the forest in the same numbers."""
@@ -186,7 +213,9 @@ def component_lengths(observed: Observed) -> tuple[IntArray, FloatArray]:
     _, component = connected_components(adjacency, directed=False)
     start, end = observed.vertices_in_base[edges.T]
     of_edge = np.linalg.norm(end - start, axis=1)
-    total = np.bincount(component[edges[:, 0]], weights=of_edge, minlength=component.max(initial=-1) + 1)
+    total = np.bincount(
+        component[edges[:, 0]], weights=of_edge, minlength=component.max(initial=-1) + 1
+    )
     return component.astype(np.int64), total[component]
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -83,6 +83,13 @@ def models_from(value: Mapping[str, Any]) -> Models:
             if name != "provenance"
         },
     )
+
+
+def models_to(models: Models) -> bytes:
+    """Return the models as JSON, one line per model."""
+    fields = asdict(models)
+    lines = (f"{json.dumps(name)}: {json.dumps(value)}" for name, value in fields.items())
+    return ("{" + ",\n ".join(lines) + "}\n").encode()
 
 
 @cache

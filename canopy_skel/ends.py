@@ -14,8 +14,10 @@ _SHORTEST_M = 0.02
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Ends:
-    """vertex: (K,) of each end; tangents: (K, 3), unit, outward; behind_m: (K,) how much wood the
-    tangent rests on. A vertex without edges has two ends."""
+    """The free ends of a forest; a vertex without edges has two.
+
+    vertex: (K,). tangents: (K, 3), unit, outward. behind_m: (K,) how much wood each rests on.
+    """
 
     vertex: IntArray
     tangents: FloatArray

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from canopy_skel.frame import Float32Array, Intrinsics, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, invert, transform_points
+from canopy_skel.pieces import depth_of
 
 UNKNOWN, THROUGH, BACKGROUND, WOOD, LEAF, HIDDEN = range(6)
 STRIDE = 2
@@ -64,13 +65,13 @@ class ViewEvidence:
 
 def evidence_of(view: View, wood: BoolArray) -> ViewEvidence:
     """Make a view ready to be asked; `wood` (H, W): a mask or a fragment covers the pixel."""
-    assert view.depth_m is not None
-    valid = np.isfinite(view.depth_m)
+    depth_m = depth_of(view)
+    valid = np.isfinite(depth_m)
     window = np.ones((_WINDOW, _WINDOW), dtype=np.uint8)
     infinite = np.float32(np.inf)
     # Outside the picture nothing may win: the default border of these filters never does.
-    nearest = cv2.erode(np.where(valid, view.depth_m, infinite), window)
-    farthest = cv2.dilate(np.where(valid, view.depth_m, -infinite), window)
+    nearest = cv2.erode(np.where(valid, depth_m, infinite), window)
+    farthest = cv2.dilate(np.where(valid, depth_m, -infinite), window)
     share = cv2.blur(valid.astype(np.float32), (_WINDOW, _WINDOW))
     around = cv2.dilate(wood.astype(np.uint8), np.ones((3, 3), dtype=np.uint8))
     every = (slice(None, None, STRIDE), slice(None, None, STRIDE))
@@ -108,7 +109,7 @@ def is_empty(counts: IntArray) -> BoolArray:
 
 def _background(missing: BoolArray) -> BoolArray:
     """Return the large regions (H, W) without return, two pixels off their rims."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(missing.astype(np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(missing.astype(np.uint8))
     large = stats[:, cv2.CC_STAT_AREA] > _BACKGROUND_PX
     large[0] = False
     region = large[labels].astype(np.uint8)

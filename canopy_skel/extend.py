@@ -25,8 +25,11 @@ class ExtensionConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Rays:
-    """What lies ahead of the chosen ends: end (K,), points (K, n, 3), features (K, n, F), and
-    whether the way is open up to there (K, n)."""
+    """What lies ahead of the chosen ends.
+
+    end: (K,). points: (K, n, 3), step by step. features: (K, n, F). open: (K, n), nothing is in
+    the way up to there.
+    """
 
     end: IntArray
     points: FloatArray

@@ -1,19 +1,21 @@
 """Fit the confidences of mode `canopy` to scans whose truth is known."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from canopy_skel.assemble import extension_probability, free_ends
+from canopy_skel.assemble import free_ends
 from canopy_skel.canopy import CanopyScan, map_cost, vertex_features
 from canopy_skel.confidence import Logistic, Models, fit_logistic
 from canopy_skel.document import SkeletonDocument
 from canopy_skel.extend import rays_of
+from canopy_skel.fusion import Observed
 from canopy_skel.geometry import BoolArray, FloatArray
 from canopy_skel.likelihood import LikelihoodMap
-from canopy_skel.links import accepted, candidates_of
+from canopy_skel.links import Candidates, Parts, accepted, candidates_of
+from canopy_skel.metrics.calibration import expected_calibration_error
 
 POINT_M = 0.015
 RIGHT_M = 0.02
@@ -27,6 +29,10 @@ class Lesson:
     scan: CanopyScan
     likelihood: LikelihoodMap
     truth: cKDTree
+
+    def cost(self, points: FloatArray) -> FloatArray:
+        """Return -log p of the likelihood map at points (N, 3)."""
+        return map_cost(self.likelihood, points)
 
     def right(self, points: FloatArray, within_m: float) -> BoolArray:
         """Say which points (N, 3) have truth within a distance."""
@@ -44,24 +50,38 @@ def truth_points(truth: SkeletonDocument) -> cKDTree:
 
 def fit_models(lessons: Sequence[Lesson], provenance: str) -> Models:
     """Fit all models, each on what the ones before it let through."""
-    instance, fragment = (
-        _fit(lessons, lambda lesson, f=f: _points(lesson, f)) for f in (False, True)
-    )
     models = Models(
-        instance_point=instance,
-        fragment_point=fragment,
+        instance_point=_fit(lessons, lambda lesson: _points(lesson, fragments=False)),
+        fragment_point=_fit(lessons, lambda lesson: _points(lesson, fragments=True)),
         vertex=_CERTAIN,
         link=_CERTAIN,
         extension=_CERTAIN,
         provenance=provenance,
     )
-    from dataclasses import replace
+    for name, rows in _LATER.items():
+        model = _fit(lessons, lambda lesson, rows=rows, so_far=models: rows(lesson, so_far))
+        models = replace(models, **{name: model})
+    return models
 
-    models = replace(models, vertex=_fit(lessons, lambda lesson: _vertices(lesson, models)))
-    models = replace(models, link=_fit(lessons, lambda lesson: _links(lesson, models)))
-    return replace(models, extension=_fit(lessons, lambda lesson: _extensions(lesson, models)))
+
+def reliability(lesson: Lesson, models: Models) -> dict[str, float]:
+    """Return the expected calibration error of each model on a scan (0 where it asks nothing)."""
+    errors = {}
+    questions: dict[str, Rows] = {
+        "instance_point": lambda lesson, _: _points(lesson, fragments=False),
+        "fragment_point": lambda lesson, _: _points(lesson, fragments=True),
+        **_LATER,
+    }
+    for name, rows in questions.items():
+        features, right = rows(lesson, models)
+        error = expected_calibration_error(
+            getattr(models, name)(features), right, np.ones(len(right))
+        )
+        errors[name] = error or 0.0
+    return errors
 
 
+Rows = Callable[[Lesson, Models], tuple[FloatArray, BoolArray]]
 _CERTAIN = Logistic(bias=5.0, weights=(), means=(), scales=())
 
 
@@ -75,35 +95,31 @@ def _fit(
     )
 
 
-def _points(lesson: Lesson, fragments: bool) -> tuple[FloatArray, BoolArray]:
+def _points(lesson: Lesson, *, fragments: bool) -> tuple[FloatArray, BoolArray]:
     points, _, _, fragment, _, features = lesson.scan.points()
     chosen = fragment == fragments
     return features[chosen], lesson.right(points[chosen], POINT_M)
 
 
+def _parts(lesson: Lesson, models: Models) -> tuple[Parts, Observed]:
+    return lesson.scan.parts(lesson.scan.observed(models)[0], models)
+
+
 def _vertices(lesson: Lesson, models: Models) -> tuple[FloatArray, BoolArray]:
-    observed = lesson.scan.observed(models)
-    parts, observed = lesson.scan.parts(observed, models)
+    parts, observed = _parts(lesson, models)
     return vertex_features(observed, parts.length_m), lesson.right(parts.points, RIGHT_M)
 
 
 def _links(lesson: Lesson, models: Models) -> tuple[FloatArray, BoolArray]:
-    parts, _ = lesson.scan.parts(lesson.scan.observed(models), models)
-    found = candidates_of(
-        parts, lesson.scan.evidence, lambda x: map_cost(lesson.likelihood, x), lesson.scan.config.links
-    )
+    parts, _ = _parts(lesson, models)
+    found = _candidates(lesson, parts)
     right = lesson.right(found.curves.reshape(-1, 3), RIGHT_M).reshape(found.curves.shape[:2])
     return found.features, right[:, 1:-1].mean(axis=1) >= LINK_SHARE
 
 
 def _extensions(lesson: Lesson, models: Models) -> tuple[FloatArray, BoolArray]:
-    scan = lesson.scan
-    parts, _ = scan.parts(scan.observed(models), models)
-
-    def cost(points: FloatArray) -> FloatArray:
-        return map_cost(lesson.likelihood, points)
-
-    found = candidates_of(parts, scan.evidence, cost, scan.config.links)
+    scan, (parts, _) = lesson.scan, _parts(lesson, models)
+    found = _candidates(lesson, parts)
     made = accepted(
         found,
         models.link(found.features),
@@ -111,6 +127,15 @@ def _extensions(lesson: Lesson, models: Models) -> tuple[FloatArray, BoolArray]:
         parts.component[parts.ends.vertex],
         scan.config.links.min_probability,
     )
-    rays = rays_of(parts, free_ends(parts, found, made), scan.evidence, cost, scan.config.extensions)
+    free = free_ends(parts, found, made)
+    rays = rays_of(parts, free, scan.evidence, lesson.cost, scan.config.extensions)
     right = lesson.right(rays.points.reshape(-1, 3), RIGHT_M).reshape(rays.open.shape)
     return rays.features[rays.open], right[rays.open]
+
+
+def _candidates(lesson: Lesson, parts: Parts) -> Candidates:
+    scan = lesson.scan
+    return candidates_of(parts, scan.evidence, lesson.cost, scan.config.links)
+
+
+_LATER: dict[str, Rows] = {"vertex": _vertices, "link": _links, "extension": _extensions}

@@ -36,8 +36,11 @@ class FusionConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Observations:
-    """Points on observed wood, (N, …) each: positions, unit directions, radii, probability to be
-    wood, the view (its bit), and whether a fragment showed it."""
+    """Points on observed wood, in canonical order.
+
+    points_in_base, directions: (N, 3), unit. radius_m, probability (to be wood): (N,). view_bits:
+    (N,), one bit per view. fragment: (N,), a fragment showed it and not an instance.
+    """
 
     points_in_base: FloatArray
     directions: FloatArray
@@ -65,6 +68,8 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
 
     The points must come in canonical order; nothing else decides ties.
     """
+    if len(seen.points_in_base) == 0:
+        return _NOTHING
     cells, cell_of = np.unique(
         voxels_of(seen.points_in_base, 2 * config.bandwidth_m), axis=0, return_inverse=True
     )
@@ -142,3 +147,11 @@ def _thinned(points: FloatArray, density: FloatArray, spacing_m: float) -> IntAr
     start = np.append(0, np.cumsum(np.bincount(both[:, 0], minlength=len(points))))
     order = np.lexsort((*points.T[::-1], -density))
     return np.flatnonzero(kernel.thinned(order, start, np.ascontiguousarray(both[:, 1])))
+
+
+_NOTHING = Observed(
+    vertices_in_base=np.zeros((0, 3)),
+    directions=np.zeros((0, 3)),
+    support=np.zeros((0, kernel.SUPPORT)),
+    edges=np.zeros((0, 2), dtype=np.int64),
+)

@@ -7,7 +7,7 @@ import numpy as np
 
 from canopy_skel.ends import Ends
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, is_empty
-from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.kernels.candidates import link_candidates
 
 Evidence = Callable[[FloatArray], IntArray]
@@ -45,8 +45,11 @@ class Candidates:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Parts:
-    """What is to be joined: vertices (V, 3), directions (V, 3), component, its length, confidence
-    and radius of each (V,); and the free ends."""
+    """What is to be joined.
+
+    points, directions: (V, 3). component: (V,). length_m: (V,), of the component. confidence,
+    radius_m: (V,). ends: the free ends.
+    """
 
     points: FloatArray
     directions: FloatArray

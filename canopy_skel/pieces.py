@@ -69,12 +69,14 @@ def regions_of_masks(masks: Sequence[BranchMask]) -> Regions:
     """Return the pixels of the masks of one view."""
     places = [np.nonzero(mask.mask) for mask in masks]
     return Regions(
-        u=np.concatenate([np.zeros(0, np.int64)] + [
-            u + mask.left_px for (_, u), mask in zip(places, masks, strict=True)
-        ]),
-        v=np.concatenate([np.zeros(0, np.int64)] + [
-            v + mask.top_px for (v, _), mask in zip(places, masks, strict=True)
-        ]),
+        u=np.concatenate(
+            [np.zeros(0, np.int64)]
+            + [u + mask.left_px for (_, u), mask in zip(places, masks, strict=True)]
+        ),
+        v=np.concatenate(
+            [np.zeros(0, np.int64)]
+            + [v + mask.top_px for (v, _), mask in zip(places, masks, strict=True)]
+        ),
         start=np.cumsum([0] + [len(v) for v, _ in places]),
         confidence=np.array([mask.confidence for mask in masks], dtype=np.float64),
         numbers=np.array([mask.instance for mask in masks], dtype=np.int64),
@@ -87,9 +89,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
     Raises:
         ViewError: the view has no depth.
     """
-    if view.depth_m is None:
-        raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
-    depth_m = usable_depth(view.depth_m[regions.v, regions.u], config).astype(np.float64)
+    depth_m = usable_depth(depth_of(view)[regions.v, regions.u], config).astype(np.float64)
     camera = view.intrinsics
     counts, knots, quality = profile.fit_regions(
         regions.u.astype(np.float64),
@@ -118,6 +118,17 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         )
         pieces.append(Piece(spline=spline, fragment=fragments, quality=quality[i]))
     return pieces
+
+
+def depth_of(view: View) -> Float32Array:
+    """Return the depth (H, W) of a view.
+
+    Raises:
+        ViewError: it has none.
+    """
+    if view.depth_m is None:
+        raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
+    return view.depth_m
 
 
 def usable_depth(depth_m: Float32Array, config: PieceConfig) -> Float32Array:

@@ -22,6 +22,7 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
 from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
+from canopy_skel.poses import PoseCorrection
 from canopy_skel.segment import BranchMask, Segmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
 from canopy_skel.wood import wood_of
@@ -67,12 +68,16 @@ class MethodConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Extraction:
-    """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1."""
+    """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1.
+
+    corrections: of views whose poses were off (method `canopy`).
+    """
 
     graph: SkeletonGraph
     voxels: int
     observed_components: int
     joins: tuple[Join, ...]
+    corrections: tuple[PoseCorrection, ...] = ()
 
 
 class Skeletonizer:
@@ -202,4 +207,5 @@ class Skeletonizer:
             voxels=self._map.voxel_count(),
             observed_components=joined.observed_components,
             joins=(),
+            corrections=joined.corrections,
         )

@@ -1,7 +1,7 @@
 """Wood outside the instance masks: what is too small or too thin for a mask of its own."""
 
-from typing import Protocol, runtime_checkable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray
-from canopy_skel.pieces import Regions
+from canopy_skel.pieces import Regions, depth_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,8 +84,7 @@ def colour_wood_probability(view: View, covered: BoolArray, config: FragmentConf
 
 def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray:
     """Say which pixels (H, W) lie at the depths that the masks span, give or take the margin."""
-    assert view.depth_m is not None
-    depth_m = view.depth_m
+    depth_m = depth_of(view)
     masked = depth_m[covered & np.isfinite(depth_m)]
     if len(masked) == 0:
         return np.zeros(covered.shape, dtype=np.bool_)
@@ -110,9 +109,11 @@ def fragments_of(probability: Float32Array, config: FragmentConfig) -> Regions:
     sizes = area[kept].astype(np.int64)
     start = np.concatenate([[0], np.cumsum(sizes)])
     v, u = v[order].astype(np.int64), u[order].astype(np.int64)
-    mean = np.add.reduceat(probability[v, u].astype(np.float64), start[:-1]) / sizes if len(
-        sizes
-    ) else np.zeros(0)
+    mean = (
+        np.add.reduceat(probability[v, u].astype(np.float64), start[:-1]) / sizes
+        if len(sizes)
+        else np.zeros(0)
+    )
     return Regions(u=u, v=v, start=start, confidence=mean, numbers=np.zeros(len(sizes), np.int64))
 
 

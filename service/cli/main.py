@@ -7,6 +7,7 @@ import typer
 from canopy_skel.errors import CanopyError, UsageError
 from service.cli.doctor import doctor
 from service.cli.export import export
+from service.cli.fit_confidence import fit_confidence
 from service.cli.inspect import inspect
 from service.cli.recover import recover
 from service.cli.replay import replay
@@ -23,7 +24,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for verb in (replay, inspect, score, recover, export, serve, scan, simulate, doctor):
+for verb in (
+    replay,
+    inspect,
+    score,
+    recover,
+    export,
+    serve,
+    scan,
+    simulate,
+    doctor,
+    fit_confidence,
+):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)
 
