@@ -13,6 +13,7 @@ import numpy as np
 
 from canopy_skel.canopy import CanopyConfig
 from canopy_skel.document import Method, build_document, from_json
+from canopy_skel.fitting import truth_points
 from canopy_skel.metrics import score
 from canopy_skel.pipeline import MethodConfig, Skeletonizer
 from canopy_skel.recording import read_recording
@@ -45,6 +46,18 @@ FIGURES = {
     "components": "parts",
     "view_ms": "ms/view",
 }
+BINS = 10
+INTRODUCTION = """# Method canopy beside method paper
+
+Made by `benchmarks/canopy_table.py` from simulated trees that nothing was fitted to. Columns are
+explained in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton
+after it, without segmentation. The number behind a recording is the share of its truth that no mask
+covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated ones;
+fragments are found by colour, and simulated colours are not an orchard's.
+
+![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
+
+"""
 CLASSES = ("light", "medium", "heavy")
 
 
@@ -58,7 +71,11 @@ def main():
     results = {path.stem: figures_of(path, arguments.cache) for path in arguments.recordings}
     page = "\n".join([*class_tables(results), *recording_table(results)]) + "\n"
     if arguments.output:
-        arguments.output.write_text(page)
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.write_text(INTRODUCTION + page)
+        for name in ("masks", "fragments"):
+            picture = arguments.output.with_name(f"{arguments.output.stem}-reliability-{name}.svg")
+            picture.write_text(reliability_diagram(results, name))
     print(page)
 
 
@@ -92,7 +109,22 @@ def run(views, truth, config):
         method=Method(name=config.name),
         views_used=len(views),
     )
-    return score(document, truth).to_dict() | {"view_ms": view_ms}
+    return score(document, truth).to_dict() | {
+        "view_ms": view_ms,
+        "reliability": reliability(document, truth),
+    }
+
+
+def reliability(document, truth):
+    """Return per part and bin of confidence [vertices, sum of confidence, right ones]."""
+    distance = truth_points(truth).query(document.position)[0]
+    which = np.clip((document.confidence * BINS).astype(int), 0, BINS - 1)
+    table = {}
+    for part, chosen in (("observed", ~document.occluded), ("predicted", document.occluded)):
+        columns = (np.ones(len(distance)), document.confidence, distance <= 0.02)
+        sums = [np.bincount(which[chosen], c[chosen], BINS).tolist() for c in columns]
+        table[part] = list(zip(*sums, strict=True))
+    return table
 
 
 def unmasked_share(truth):
@@ -110,6 +142,28 @@ def class_of(unmasked):
     The limits are halfway between these.
     """
     return CLASSES[int(unmasked > 0.375) + int(unmasked > 0.625)]
+
+
+def reliability_diagram(results, run_name):
+    """Return an SVG: share right over mean confidence, area of a dot by its vertices."""
+    marks = []
+    for part, colour in (("observed", "#0072b2"), ("predicted", "#d55e00")):
+        total = np.sum([r[run_name]["reliability"][part] for r in results.values()], axis=0)
+        for count, confidence, right in total[total[:, 0] > 0]:
+            x, y = 40 + 240 * confidence / count, 260 - 240 * right / count
+            radius = 2 + 10 * np.sqrt(count / total[:, 0].sum())
+            marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{colour}"/>')
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 300 300" font-size="11"'
+        ' font-family="sans-serif"><rect width="300" height="300" fill="#fff"/>'
+        '<path d="M40 20V260H280" fill="none" stroke="#000"/>'
+        '<path d="M40 260L280 20" stroke="#999" stroke-dasharray="4"/>'
+        '<text x="130" y="282">confidence</text><text x="22" y="264">0</text>'
+        '<text x="276" y="275">1</text><text x="28" y="26">1</text>'
+        '<text x="50" y="34" fill="#0072b2">observed</text>'
+        '<text x="50" y="48" fill="#d55e00">predicted</text>'
+        f'<text x="110" y="14">share right, {LABELS[run_name]}</text>' + "".join(marks) + "</svg>\n"
+    )
 
 
 def class_tables(results):

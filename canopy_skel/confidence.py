@@ -34,12 +34,14 @@ class Logistic:
         return np.asarray(1.0 / (1.0 + np.exp(-np.clip(total, -30.0, 30.0))))
 
 
-def fit_logistic(
-    features: FloatArray, right: ArrayLike, weight: FloatArray | None = None, ridge: float = 1.0
-) -> Logistic:
-    """Fit by Newton's method: features (N, F), right (N,) bool, weights (N,), ridge on weights."""
+def fit_logistic(features: FloatArray, right: ArrayLike, ridge: float = 1.0) -> Logistic:
+    """Fit by Newton's method: features (N, F), right (N,) bool; `ridge` keeps weights finite.
+
+    Nothing to learn from gives even odds.
+    """
     y = np.asarray(right, dtype=np.float64)
-    w = np.ones(len(y)) if weight is None else weight
+    if len(y) == 0:
+        return Logistic(bias=0.0, weights=(), means=(), scales=())
     means, scales = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
     design = np.column_stack([np.ones(len(y)), (features - means) / scales])
     penalty = np.full(design.shape[1], ridge)
@@ -47,8 +49,8 @@ def fit_logistic(
     beta = np.zeros(design.shape[1])
     for _ in range(40):
         p = 1.0 / (1.0 + np.exp(-np.clip(design @ beta, -30.0, 30.0)))
-        gradient = design.T @ (w * (y - p)) - penalty * beta
-        hessian = (design * (w * p * (1.0 - p))[:, None]).T @ design + np.diag(penalty)
+        gradient = design.T @ (y - p) - penalty * beta
+        hessian = (design * (p * (1.0 - p))[:, None]).T @ design + np.diag(penalty)
         step = np.linalg.solve(hessian, gradient)
         beta += np.clip(step, -2.0, 2.0)
         if np.abs(step).max() < 1e-8:

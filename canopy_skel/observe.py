@@ -25,12 +25,13 @@ SAMPLE_M = 0.005
 class Observation:
     """What one view shows.
 
-    splines: the pieces as polylines. points_in_base, directions: (N, 3), along the pieces;
+    splines: the pieces as polylines. dropped: instances without enough depth. points_in_base, directions: (N, 3), along the pieces;
     radius_m, fragment: (N,); quality: (N, 7), score and quality of the piece. evidence: the view,
     ready to be asked.
     """
 
     splines: list[BranchSpline]
+    dropped: tuple[int, ...]
     points_in_base: FloatArray
     directions: FloatArray
     radius_m: FloatArray
@@ -56,6 +57,7 @@ def observe(
     """
     regions = regions_of_masks(masks)
     pieces = pieces_of(view, regions, pieces_config, fragments=False)
+    lifted = {piece.spline.instance for piece in pieces}
     wood = mask_image(view, regions)
     if fragments_config is not None:
         if probability is None:
@@ -69,6 +71,7 @@ def observe(
     points, directions, of = sampled(pieces)
     return Observation(
         splines=[piece.spline for piece in pieces],
+        dropped=tuple(mask.instance for mask in masks if mask.instance not in lifted),
         points_in_base=points,
         directions=directions,
         radius_m=np.array([p.spline.radius_m for p in pieces])[of],

@@ -160,6 +160,12 @@ class Skeletonizer:
         self._splines[view.index] = seen.splines
         self._cameras[view.index] = view.base_from_camera[:3, 3]
         self._instances += len(masks)
+        self._rejected.extend(
+            RejectedInstance(
+                view_index=view.index, instance=instance, reason="too few points with trusted depth"
+            )
+            for instance in seen.dropped
+        )
         return len(seen.splines)
 
     def _check_place(self, view: View) -> None:

@@ -1,5 +1,5 @@
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import permutations
 
 import numpy as np
@@ -100,6 +100,24 @@ def test_rooted_gives_one_tree_whose_extra_joins_nobody_will_believe(views):
     assert rooted.components == 1
     assert rooted.confidence[rooted.occluded].min() <= 0.1
     assert len(rooted.edges) == len(rooted.position) - 1
+
+
+def test_a_view_whose_pose_is_off_is_moved_back_and_the_others_are_not():
+    good = [
+        view_from(i, y=y, z=z)
+        for i, (y, z) in enumerate([(0, 0), (0.08, 0), (-0.08, 0.05), (0, 0.1)])
+    ]
+    last = view_from(4, y=0.04)
+    pose = last.base_from_camera.copy()
+    pose[1, 3] += 0.007
+    extraction = maker_of([*good, replace(last, base_from_camera=pose)]).skeleton()
+    (correction,) = extraction.corrections
+    assert correction.view_bit == 1 << 4
+    assert correction.after_m < 0.5 * correction.before_m
+    assert correction.moved[1, 3] + correction.moved[1, :3] @ [1, 0, 0] == pytest.approx(
+        -0.007, abs=0.003
+    )
+    assert maker_of([*good, last]).skeleton().corrections == ()
 
 
 def test_documents_keep_how_each_vertex_is_known(views):

@@ -8,9 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scenes.wood import view_from
+from scenes.leaves import leafy_view
+from scenes.wood import WOOD, view_from
 
-from canopy_skel.document import from_json
+from canopy_skel.confidence import models_from
+from canopy_skel.document import Method, build_document, from_json, to_json
+from canopy_skel.graph import SkeletonGraph
 from canopy_skel.recording import RecordingWriter
 from service import cli
 
@@ -38,11 +41,40 @@ def recording(tmp_path):
     return path
 
 
-def write(path, views):
+def write(path, views, truth=None):
     metadata = {"scan_id": "sticks-1"}
     with RecordingWriter(path, metadata, tool_from_camera=np.eye(4)) as writer:
         for view in views:
             writer.write_view(view)
+        if truth is not None:
+            writer.attach("ground_truth_skeleton.json", "application/json", truth)
+
+
+def test_fit_confidence_writes_models_that_know_where_they_come_from(canopy, tmp_path):
+    path, models = tmp_path / "leafy.mcap", tmp_path / "models.json"
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)])
+    code, _, stderr = canopy("fit-confidence", path, "-o", models)
+    assert (code, "no true skeleton is attached" in stderr) == (1, True)
+    truth = build_document(
+        sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0
+    )
+    path.unlink()
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)], to_json(truth))
+    code, stdout, _ = canopy("fit-confidence", path, "-o", models, "--held-out", path)
+    assert code == 0
+    assert stdout.startswith("leafy: instance_point 0.")
+    assert models_from(json.loads(models.read_bytes())).provenance == "fitted to 1 scans: leafy"
+
+
+def sticks():
+    points = np.array([point for start, end, _ in WOOD for point in (start, end)])
+    return SkeletonGraph(
+        vertices_in_base=points,
+        edges=np.arange(6).reshape(3, 2),
+        radius_m=np.full(6, 0.01),
+        occluded=np.zeros(6, dtype=bool),
+        confidence=np.ones(6),
+    )
 
 
 def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path):
