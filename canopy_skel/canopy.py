@@ -169,8 +169,9 @@ class CanopyScan:
 
 def map_cost(likelihood: LikelihoodMap, points_in_base: FloatArray) -> FloatArray:
     """Return -log p_l (N,) of the likelihood map at points, capped where it says nothing."""
-    empty = np.exp(-likelihood.nats_at(points_in_base))
-    return np.asarray(-np.log(np.maximum(1.0 - empty, np.exp(-NO_MAP_NATS))))
+    voxels = np.floor(points_in_base / likelihood.voxel_size_m).astype(np.int32)
+    probability = likelihood.probability_at(voxels)
+    return np.asarray(-np.log(np.maximum(probability, np.exp(-NO_MAP_NATS))))
 
 
 def point_features(seen: Observation, counts: IntArray) -> FloatArray:

@@ -19,7 +19,7 @@ class ExtensionConfig:
 
     step_m: float = 0.005
     reach_m: float = 0.15
-    min_probability: float = 0.7
+    min_probability: float = 0.5
     clear_m: float = 0.012
 
 

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.initial import prune_spurs
 from canopy_skel.kernels import fuse as kernel
-from canopy_skel.likelihood import VoxelIndex, voxels_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -70,12 +69,9 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     """
     if len(seen.points_in_base) == 0:
         return _NOTHING
-    cells, cell_of = np.unique(
-        voxels_of(seen.points_in_base, 2 * config.bandwidth_m), axis=0, return_inverse=True
-    )
-    order = np.argsort(cell_of.ravel(), kind="stable")
-    start = np.append(0, np.cumsum(np.bincount(cell_of.ravel(), minlength=len(cells))))
-    index = VoxelIndex(cells)
+    cell_m = 2 * config.bandwidth_m
+    keys = kernel.cell_keys(seen.points_in_base, cell_m)
+    order = np.argsort(keys, kind="stable")
     weight = seen.probability * np.where(seen.fragment, config.fragment_weight, 1.0)
     seeds = _seeds(seen, weight, config.seed_m)
     points, directions = seen.points_in_base[seeds], seen.directions[seeds]
@@ -92,11 +88,8 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
             seen.probability[order],
             seen.view_bits[order],
             seen.fragment[order],
-            start,
-            index.top,
-            index.origin,
-            index.slots,
-            2 * config.bandwidth_m,
+            keys[order],
+            cell_m,
             config.bandwidth_m,
             config.radius_share,
             np.cos(np.radians(config.max_angle_deg)),
@@ -131,10 +124,10 @@ def forest(points: FloatArray, directions: FloatArray, reach_m: float) -> IntArr
 
 def _seeds(seen: Observations, weight: FloatArray, seed_m: float) -> IntArray:
     """Return the heaviest point of each cell that holds any, in the order of the points."""
-    _, of = np.unique(voxels_of(seen.points_in_base, seed_m), axis=0, return_inverse=True)
-    order = np.lexsort((np.arange(len(of)), -weight, of.ravel()))
+    of = kernel.cell_keys(seen.points_in_base, seed_m)
+    order = np.lexsort((np.arange(len(of)), -weight, of))
     first = np.ones(len(of), dtype=np.bool_)
-    first[1:] = np.diff(of.ravel()[order]) > 0
+    first[1:] = np.diff(of[order]) > 0
     return np.sort(order[first])
 
 

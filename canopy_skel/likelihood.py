@@ -162,21 +162,25 @@ class LikelihoodMap:
             voxel_size_m=self._config.voxel_size_m, voxels=voxels[order], units=units[order]
         )
 
-    def voxel_count(self) -> int:
-        """Return how many voxels have p_l > 0."""
+    @property
+    def voxel_size_m(self) -> float:
+        """The edge of a voxel."""
+        return self._config.voxel_size_m
+
+    def occupied(self) -> int:
+        """Return the number of voxels with p_l > 0."""
         return int(np.count_nonzero(self._sums))
 
-    def nats_at(self, points_in_base: FloatArray) -> FloatArray:
-        """Return -log(1 - p_l) (N,) of the voxels that points (N, 3) lie in."""
-        voxels = np.floor(points_in_base / self._config.voxel_size_m).astype(np.int64)
+    def probability_at(self, voxels: Int32Array) -> FloatArray:
+        """Return p_l (N,) of (N, 3) voxels."""
         block, inside = (voxels >> 3) - self._origin, voxels & 7
-        nats = np.zeros(len(voxels))
+        units = np.zeros(len(voxels))
         known = np.flatnonzero(np.all((block >= 0) & (block < self._top.shape), axis=1))
         slot = self._top[tuple(block[known].T)]
         known, slot = known[slot >= 0], slot[slot >= 0]
         x, y, z = inside[known].T
-        nats[known] = self._sums[slot, (x << 6) | (y << 3) | z] / ellipsoid.UNITS_PER_NAT
-        return nats
+        units[known] = self._sums[slot, (x << 6) | (y << 3) | z]
+        return np.asarray(-np.expm1(units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
 
     def _check_memory(self, starts: FloatArray, lengths: FloatArray, radii: FloatArray) -> None:
         k = self._config.k

@@ -24,7 +24,7 @@ class LinkConfig:
     """
 
     reach_m: float = 0.25
-    min_probability: float = 0.5
+    min_probability: float = 0.4
     candidates: int = 6
     spacing_m: float = 0.008
 

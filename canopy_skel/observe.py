@@ -25,9 +25,9 @@ SAMPLE_M = 0.005
 class Observation:
     """What one view shows.
 
-    splines: the pieces as polylines. dropped: instances without enough depth. points_in_base, directions: (N, 3), along the pieces;
-    radius_m, fragment: (N,); quality: (N, 7), score and quality of the piece. evidence: the view,
-    ready to be asked.
+    splines: the pieces as polylines. dropped: instances without enough depth. points_in_base,
+    directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 7), score and
+    quality of the piece. evidence: the view, ready to be asked.
     """
 
     splines: list[BranchSpline]

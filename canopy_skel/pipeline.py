@@ -210,7 +210,7 @@ class Skeletonizer:
         joined = skeleton_of(self._canopy, self._map, shipped_models())
         return Extraction(
             graph=joined.graph,
-            voxels=self._map.voxel_count(),
+            voxels=self._map.occupied(),
             observed_components=joined.observed_components,
             joins=(),
             corrections=joined.corrections,

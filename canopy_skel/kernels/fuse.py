@@ -6,13 +6,26 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import find
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Int32s = NDArray[np.int32]
 SUPPORT = 6
 """Columns: total weight, radius, mean p, largest p, views, share of weight from instances."""
+
+
+@njit(cache=True, nogil=True)
+def cell_key(x: int, y: int, z: int) -> int:
+    """Return one number per cell; cells in a row along z follow one another."""
+    return ((x + 1048576) << 42) | ((y + 1048576) << 21) | (z + 1048576)
+
+
+@njit(cache=True, nogil=True)
+def cell_keys(points: Floats, cell_m: float) -> Ints:
+    """Return the number of the cell that each of (N, 3) points lies in."""
+    keys = np.zeros(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        keys[i] = cell_key(math.floor(x / cell_m), math.floor(y / cell_m), math.floor(z / cell_m))
+    return keys
 
 
 @njit(cache=True, nogil=True)
@@ -27,10 +40,7 @@ def shift_across(
     probability: Floats,
     view_bits: Ints,
     fragment: NDArray[np.bool_],
-    cell_start: Ints,
-    top: Int32s,
-    origin: Ints,
-    slots: Int32s,
+    keys: Ints,
     cell_m: float,
     bandwidth_m: float,
     radius_share: float,
@@ -38,7 +48,8 @@ def shift_across(
 ) -> tuple[Floats, Floats, Floats]:
     """Move points (P, 3) to the weighted mean of the references, across their direction only.
 
-    References (R, 3) lie sorted by cells of `cell_m`. The bandwidth is the larger of `bandwidth_m`
+    References (R, 3) lie sorted by the `keys` of their cells of `cell_m`. The bandwidth is the
+    larger of `bandwidth_m`
     and a share of the point's radius; references count within twice that and with |cos| of the
     angle between the directions of at least `min_cosine`. Returns the moved points, the mean
     directions, and the support (P, SUPPORT).
@@ -57,34 +68,32 @@ def shift_across(
             for y in range(
                 math.floor((py - reach) / cell_m), math.floor((py + reach) / cell_m) + 1
             ):
-                for z in range(
-                    math.floor((pz - reach) / cell_m), math.floor((pz + reach) / cell_m) + 1
-                ):
-                    cell = find(top, origin, slots, x, y, z)
-                    if cell < 0:
+                low = cell_key(x, y, math.floor((pz - reach) / cell_m))
+                high = cell_key(x, y, math.floor((pz + reach) / cell_m))
+                j = np.searchsorted(keys, low) - 1
+                while j + 1 < len(keys) and keys[j + 1] <= high:
+                    j += 1
+                    wx = references[j, 0] - px
+                    wy = references[j, 1] - py
+                    wz = references[j, 2] - pz
+                    squared = wx * wx + wy * wy + wz * wz
+                    if squared > reach * reach:
                         continue
-                    for j in range(cell_start[cell], cell_start[cell + 1]):
-                        wx = references[j, 0] - px
-                        wy = references[j, 1] - py
-                        wz = references[j, 2] - pz
-                        squared = wx * wx + wy * wy + wz * wz
-                        if squared > reach * reach:
-                            continue
-                        rx, ry, rz = reference_directions[j]
-                        cosine = dx * rx + dy * ry + dz * rz
-                        if abs(cosine) < min_cosine:
-                            continue
-                        weight = weights[j] * math.exp(-0.5 * squared / (width * width))
-                        signed = weight if cosine > 0.0 else -weight
-                        total += weight
-                        ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
-                        ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
-                        r += weight * reference_radii[j]
-                        mean_p += weight * probability[j]
-                        largest = max(largest, probability[j])
-                        bits |= view_bits[j]
-                        if not fragment[j]:
-                            masks += weight
+                    rx, ry, rz = reference_directions[j]
+                    cosine = dx * rx + dy * ry + dz * rz
+                    if abs(cosine) < min_cosine:
+                        continue
+                    weight = weights[j] * math.exp(-0.5 * squared / (width * width))
+                    signed = weight if cosine > 0.0 else -weight
+                    total += weight
+                    ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
+                    ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
+                    r += weight * reference_radii[j]
+                    mean_p += weight * probability[j]
+                    largest = max(largest, probability[j])
+                    bits |= view_bits[j]
+                    if not fragment[j]:
+                        masks += weight
         norm = math.sqrt(ex * ex + ey * ey + ez * ez)
         if total > 0.0 and norm > 1e-9:
             ex, ey, ez = ex / norm, ey / norm, ez / norm

@@ -28,6 +28,8 @@ from canopy_skel.pipeline import MethodConfig, Skeletonizer
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.wood import FragmentConfig, WoodDetector, colour_wood_probability, fragments_of
 
+PLAIN = view_from(0)
+
 
 @pytest.fixture(scope="module")
 def views():
@@ -73,7 +75,7 @@ def test_the_skeleton_lies_in_the_wood_and_a_link_bridges_what_leaves_hide(views
 
 
 def test_nothing_is_predicted_where_the_sky_shows_through():
-    clear = document_of(maker_of([view_from(0), view_from(1, y=0.1), view_from(2, z=0.1)]))
+    clear = document_of(maker_of([PLAIN, view_from(1, y=0.1), view_from(2, z=0.1)]))
     assert not clear.occluded.any()
 
 
@@ -126,7 +128,7 @@ def test_documents_keep_how_each_vertex_is_known(views):
 
 
 def test_views_without_wood_give_an_empty_skeleton():
-    maker = maker_of([view_from(0, instances=np.zeros((240, 320), np.uint16))])
+    maker = maker_of([replace(PLAIN, instances=np.zeros((240, 320), np.uint16))])
     extraction = maker.skeleton()
     assert len(extraction.graph.vertices_in_base) == 0
     assert extraction.voxels == 0
@@ -144,7 +146,7 @@ def test_settings_survive_being_taken_apart():
 
 
 def test_pieces_run_along_the_axes_of_the_sticks():
-    view = view_from(0)
+    view = PLAIN
     regions = regions_of_masks(RecordedSegmenter().segment(view))
     pieces = pieces_of(view, regions, PieceConfig(), fragments=False)
     assert len(pieces) == 3
@@ -157,12 +159,12 @@ def test_pieces_run_along_the_axes_of_the_sticks():
 
 
 def test_leaves_that_cover_some_pixels_do_not_move_a_piece():
-    view = view_from(0)
+    view = PLAIN
     depth_m = view.depth_m.copy()
     rows, columns = np.nonzero(view.instances == 1)
     hit = np.random.default_rng(1).random(len(rows)) < 0.4
     depth_m[rows[hit], columns[hit]] = 0.8
-    spoilt = view_from(0, depth_m=depth_m)
+    spoilt = replace(PLAIN, depth_m=depth_m)
     regions = regions_of_masks(RecordedSegmenter().segment(spoilt))
     trunk = pieces_of(spoilt, regions, PieceConfig(), fragments=False)[0]
     assert off_wood(trunk.spline.control_points_in_base).max() < 0.006
@@ -178,8 +180,7 @@ def test_leaves_that_cover_some_pixels_do_not_move_a_piece():
 def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
     stick, along, fraction, beyond
 ):
-    view = view_from(0)
-    evidence = evidence_of(view, view.instances > 0)
+    evidence = evidence_of(PLAIN, PLAIN.instances > 0)
     start, end, _ = WOOD[stick]
     wood = np.array(start) + along * np.subtract(end, start)
     counts = count_evidence(
@@ -192,7 +193,7 @@ def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
 
 
 def test_colour_tells_unmasked_wood_from_leaves():
-    view = view_from(0)
+    view = PLAIN
     color = np.zeros((240, 320, 3), np.uint8)
     noise = np.random.default_rng(0).integers(-8, 9, color.shape)
     color[:] = np.clip(np.array([60, 120, 40]) + noise, 0, 255)
@@ -200,7 +201,7 @@ def test_colour_tells_unmasked_wood_from_leaves():
     color[wood] = np.clip(np.array([110, 90, 80]) + noise[wood], 0, 255)
     depth_m = np.where(np.isnan(view.depth_m), np.float32(1.05), view.depth_m)
     masked = wood & (view.instances != 3)
-    coloured = view_from(0, color_rgb=color, depth_m=depth_m)
+    coloured = replace(PLAIN, color_rgb=color, depth_m=depth_m)
     probability = colour_wood_probability(coloured, masked, FragmentConfig())
     found = fragments_of(probability, FragmentConfig())
     shown = np.zeros(wood.shape, bool)
@@ -213,13 +214,13 @@ def test_colour_tells_unmasked_wood_from_leaves():
 def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():
     class Detector(RecordedSegmenter):
         def wood_probability(self, view):
-            return np.where(view_from(0).instances == 3, np.float32(0.95), np.float32(0.05))
+            return np.where(PLAIN.instances == 3, np.float32(0.95), np.float32(0.05))
 
-    view = view_from(0)
+    view = PLAIN
     masks = np.where(view.instances == 3, 0, view.instances).astype(np.uint16)
     maker = Skeletonizer(Detector(), MethodConfig(name="canopy"))
     assert isinstance(Detector(), WoodDetector)
-    assert maker.add_view(view_from(0, instances=masks)) == 3
+    assert maker.add_view(replace(PLAIN, instances=masks)) == 3
 
 
 @settings(deadline=None, max_examples=30)
