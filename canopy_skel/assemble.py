@@ -160,6 +160,8 @@ class Chain:
 
 def with_chains(graph: SkeletonGraph, chains: list[Chain]) -> SkeletonGraph:
     """Add predicted vertices in rows."""
+    if not chains:
+        return graph
     count, edges = len(graph.vertices_in_base), [graph.edges]
     for chain in chains:
         row = [chain.start, *range(count, count + len(chain.points))]

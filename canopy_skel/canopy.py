@@ -27,6 +27,7 @@ from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_correc
 from canopy_skel.segment import BranchMask
 from canopy_skel.wood import FragmentConfig
 
+POINT_FEATURES = 13
 NO_MAP_NATS = 12.0
 """-log p where the likelihood map says nothing."""
 
@@ -105,29 +106,26 @@ class CanopyScan:
         return count_evidence(points_in_base, [one.evidence for one in self._seen.values()])
 
     def points(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, IntArray, FloatArray]:
-        """Return all observed points: positions, directions, radii, fragment, view bits, features.
+        """Return all observed points: positions, directions, radii, fragment, view, features.
 
         In the order of the views' numbers.
         """
         order = sorted(self._seen)
         seen = [self._seen[i] for i in order]
         features = [point_features(self._seen[i], self._counts[i]) for i in order]
-        bits = [
-            np.full(len(s.points_in_base), 1 << (n % 62), dtype=np.int64)
-            for n, s in enumerate(seen)
-        ]
+        view = [np.full(len(s.points_in_base), n, dtype=np.int64) for n, s in enumerate(seen)]
         return (
-            np.concatenate([s.points_in_base for s in seen]),
-            np.concatenate([s.directions for s in seen]),
-            np.concatenate([s.radius_m for s in seen]),
-            np.concatenate([s.fragment for s in seen]),
-            np.concatenate(bits),
-            np.concatenate(features),
+            np.concatenate([np.zeros((0, 3)), *(s.points_in_base for s in seen)]),
+            np.concatenate([np.zeros((0, 3)), *(s.directions for s in seen)]),
+            np.concatenate([np.zeros(0), *(s.radius_m for s in seen)]),
+            np.concatenate([np.zeros(0, dtype=np.bool_), *(s.fragment for s in seen)]),
+            np.concatenate([np.zeros(0, dtype=np.int64), *view]),
+            np.concatenate([np.zeros((0, POINT_FEATURES)), *features]),
         )
 
     def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
         """Return the fused forest of what was seen, and which views were moved for it."""
-        points, directions, radius_m, fragment, bits, features = self.points()
+        points, directions, radius_m, fragment, view, features = self.points()
         probability = np.where(
             fragment, models.fragment_point(features), models.instance_point(features)
         )
@@ -137,7 +135,7 @@ class CanopyScan:
             directions=directions[kept],
             radius_m=radius_m[kept],
             probability=probability[kept],
-            view_bits=bits[kept],
+            view=view[kept],
             fragment=fragment[kept],
         )
         fused = fuse(seen, self.config.fusion)

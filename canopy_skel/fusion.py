@@ -11,6 +11,9 @@ from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.initial import prune_spurs
 from canopy_skel.kernels import fuse as kernel
 
+_BITS = 62
+"""Views are counted by bits of one number: of more than these some count as one."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FusionConfig:
@@ -37,15 +40,15 @@ class FusionConfig:
 class Observations:
     """Points on observed wood, in canonical order.
 
-    points_in_base, directions: (N, 3), unit. radius_m, probability (to be wood): (N,). view_bits:
-    (N,), one bit per view. fragment: (N,), a fragment showed it and not an instance.
+    points_in_base, directions: (N, 3), unit. radius_m, probability (to be wood): (N,). view: (N,),
+    its place among those that are in. fragment: (N,), a fragment showed it and not an instance.
     """
 
     points_in_base: FloatArray
     directions: FloatArray
     radius_m: FloatArray
     probability: FloatArray
-    view_bits: IntArray
+    view: IntArray
     fragment: BoolArray
 
 
@@ -86,7 +89,7 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
             seen.radius_m[order],
             weight[order],
             seen.probability[order],
-            seen.view_bits[order],
+            np.left_shift(1, seen.view[order] % _BITS),
             seen.fragment[order],
             keys[order],
             cell_m,

@@ -160,7 +160,7 @@ def _shares(counts: IntArray, links: int) -> FloatArray:
             counts[:, THROUGH] + counts[:, BACKGROUND] > 1,
         ]
     )
-    return np.asarray(flags.reshape(links, -1, 5).mean(axis=1))
+    return np.asarray(flags.reshape(links, _SAMPLES - 2, 5).mean(axis=1))
 
 
 def accepted(

@@ -28,9 +28,13 @@ class PoseConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class PoseCorrection:
-    """A view that was moved: `moved` (4, 4), base from base as reported; spread before, after."""
+    """A view that was moved: its place among those that are in, and by what.
 
-    view_bit: int
+    moved: (4, 4), maps points of the view as reported to where they belong, in base. before_m,
+    after_m: median distance of its wood from the fused skeleton, across it.
+    """
+
+    view: int
     moved: FloatArray
     before_m: float
     after_m: float
@@ -47,16 +51,14 @@ def pose_corrections(
         return []
     tree = cKDTree(fused.vertices_in_base)
     found = []
-    for bit in np.unique(seen.view_bits).tolist():
-        chosen = np.flatnonzero((seen.view_bits == bit) & ~seen.fragment)
+    for view in np.unique(seen.view).tolist():
+        chosen = np.flatnonzero((seen.view == view) & ~seen.fragment)
         if len(chosen) < config.min_points:
             continue
         points, directions = seen.points_in_base[chosen], seen.directions[chosen]
         moved, before_m, after_m = _aligned(points, directions, fused, tree, config)
         if before_m >= config.worst_m and after_m <= config.enough * before_m:
-            found.append(
-                PoseCorrection(view_bit=bit, moved=moved, before_m=before_m, after_m=after_m)
-            )
+            found.append(PoseCorrection(view=view, moved=moved, before_m=before_m, after_m=after_m))
     return found
 
 
@@ -64,7 +66,7 @@ def corrected(seen: Observations, corrections: list[PoseCorrection]) -> FloatArr
     """Return the positions (N, 3) of the points with the views moved."""
     points = seen.points_in_base.copy()
     for one in corrections:
-        chosen = seen.view_bits == one.view_bit
+        chosen = seen.view == one.view
         points[chosen] = transform_points(one.moved, points[chosen])
     return points
 

@@ -190,7 +190,7 @@ def _summary(
             {
                 "before_mm": round(1000 * one.before_m, 2),
                 "after_mm": round(1000 * one.after_m, 2),
-                "view": skeletonizer.views[one.view_bit.bit_length() - 1],
+                "view": skeletonizer.views[one.view],
             }
             for one in extraction.corrections
         ],

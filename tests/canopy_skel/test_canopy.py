@@ -114,7 +114,7 @@ def test_a_view_whose_pose_is_off_is_moved_back_and_the_others_are_not():
     pose[1, 3] += 0.007
     extraction = maker_of([*good, replace(last, base_from_camera=pose)]).skeleton()
     (correction,) = extraction.corrections
-    assert correction.view_bit == 1 << 4
+    assert correction.view == 4
     assert correction.after_m < 0.5 * correction.before_m
     assert correction.moved[1, 3] + correction.moved[1, :3] @ [1, 0, 0] == pytest.approx(
         -0.007, abs=0.003
