@@ -12,7 +12,7 @@ from canopy_skel.fusion import Observed
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.likelihood import LikelihoodMap
-from canopy_skel.links import Candidates, Parts, accepted, candidates_of
+from canopy_skel.links import Candidates, Parts, accepted, candidates_of, possible
 from canopy_skel.poses import PoseCorrection
 
 TAIL_CONFIDENCE = 0.1
@@ -39,7 +39,7 @@ def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> 
         return map_cost(likelihood, points)
 
     candidates = candidates_of(parts, scan.evidence, cost, config.links)
-    probability = models.link(candidates.features)
+    probability = possible(candidates, models.link(candidates.features), config.links.max_empty)
     made = accepted(
         candidates,
         probability,

@@ -20,10 +20,12 @@ Cost = Callable[[FloatArray], FloatArray]
 class LinkConfig:
     """Links of at most `reach_m` and of probability at least `min_probability` are made.
 
-    Of each end the `candidates` best are asked; curves are drawn every `spacing_m`.
+    A link more than `max_empty` of which runs where nothing can be is not made, whatever its
+    probability. Of each end the `candidates` best are asked; curves are drawn every `spacing_m`.
     """
 
     reach_m: float = 0.25
+    max_empty: float = 0.3
     min_probability: float = 0.4
     candidates: int = 6
     spacing_m: float = 0.008
@@ -61,6 +63,8 @@ class Parts:
 
 
 _SAMPLES = 17
+_EMPTY_SHARE = 6
+"""Its column among the features of a link."""
 
 
 def candidates_of(
@@ -161,6 +165,11 @@ def _shares(counts: IntArray, links: int) -> FloatArray:
         ]
     )
     return np.asarray(flags.reshape(links, _SAMPLES - 2, 5).mean(axis=1))
+
+
+def possible(candidates: Candidates, probability: FloatArray, max_empty: float) -> FloatArray:
+    """Return the probabilities (L,), 0 of links through places that were seen to be empty."""
+    return np.where(candidates.features[:, _EMPTY_SHARE] > max_empty, 0.0, probability)
 
 
 def accepted(

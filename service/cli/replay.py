@@ -25,7 +25,7 @@ MOST_MAP_MEMORY = 3 << 30
 def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "canopy",
     segmenter: Annotated[str, typer.Option(help="Where branch masks come from.")] = "recorded",
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
     formats: Annotated[str, typer.Option(help=f"Of {','.join(FORMATS)}.")] = "json,glb",

@@ -80,7 +80,9 @@ def sticks():
 def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path):
     out = tmp_path / "out"
     formats = "json,glb,swc,ply,csv,graphml"
-    code, stdout, _ = canopy("replay", recording, "-o", out, "--formats", formats)
+    code, stdout, _ = canopy(
+        "replay", recording, "-o", out, "--formats", formats, "--method", "paper"
+    )
     assert code == 0
     names = [f"sticks.skeleton.{name}" for name in formats.split(",")]
     names += ["sticks.overlay.png", "sticks.summary.json"]
@@ -95,6 +97,17 @@ def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path)
     assert summary["joins"]["observed_components"] == 1 + len(summary["joins"]["paths"])
     assert summary["map"]["occupied_voxels"] > 1000
     assert set(summary["seconds"]) >= {"read", "cluster", "spline", "likelihood", "initial", "join"}
+
+
+def test_canopy_is_the_method_unless_another_is_named(canopy, recording, tmp_path):
+    assert canopy("replay", recording, "-o", tmp_path, "--rooted")[0] == 0
+    document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())
+    assert document.method.name == "canopy"
+    assert document.components == 1
+    assert set(document.extra["source"]) == {"observed", "link"}
+    summary = json.loads((tmp_path / "sticks.summary.json").read_text())
+    assert summary["poses"] == []
+    assert set(summary["seconds"]) >= {"read", "observe", "evidence", "likelihood", "canopy"}
 
 
 def test_the_same_recording_gives_the_same_bytes(canopy, recording, tmp_path):
@@ -114,7 +127,7 @@ def test_json_on_stdout_is_all_there_is_on_stdout(canopy, recording, tmp_path):
 
 
 def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
-    for method in ("paper", "mst", "ftsem"):
+    for method in ("canopy", "paper", "mst", "ftsem"):
         code, _, _ = canopy("replay", recording, "-o", tmp_path / method, "--method", method)
         assert code == 0
         document = from_json((tmp_path / method / "sticks.skeleton.json").read_bytes())
@@ -124,7 +137,7 @@ def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--method", "best"], "unknown method 'best': choose one of paper, mst, ftsem"),
+        (["--method", "best"], "unknown method 'best': choose one of canopy, paper, mst, ftsem"),
         (["--segmenter", "eyes"], "unknown segmenter 'eyes': choose one of recorded"),
         (["--formats", "json,obj"], "unknown format 'obj': choose from json"),
         (["--voxel", "0"], "voxel size 0.0 m: give a length above 0"),
