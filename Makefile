@@ -7,7 +7,7 @@ VALIDATOR := $(VENV)/gltf_validator
 RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
 
-.PHONY: setup demo demo-replay test check bench results departures figures
+.PHONY: setup demo demo-replay test check bench bench-scan results departures figures
 
 setup: $(READY)
 
@@ -45,6 +45,9 @@ check: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/stages.py
+
+bench-scan: $(RUNS)
+	$(BIN)/python benchmarks/waypoints.py
 
 results: $(READY)
 	$(BIN)/python benchmarks/recordings.py ../shared/data/recordings --output docs/results.md

@@ -74,6 +74,10 @@ class GuardedArm:
         """Return the state of the arm."""
         return self._arm.state()
 
+    def check(self) -> None:
+        """Raise what keeps the arm from moving."""
+        self._arm.check()
+
     def stop(self) -> None:
         """Stop the arm."""
         self._arm.stop()
@@ -102,13 +106,23 @@ def check(move: Move, state: ArmState, limits: Limits) -> None:
     """
     _check_caps(move, limits)
     joints = _way(move, state)
-    body = kinematics.joint_origins(joints)[:, 1:]
-    tool = _tool_points(joints, limits.tool_points_in_tool0)
+    _check_rates(move, joints, _check_places(joints, limits), limits)
+
+
+def check_posture(joints_rad: FloatArray, limits: Limits) -> None:
+    """Raise WorkspaceError if the arm must not stand with these joints (6,)."""
+    _check_places(joints_rad[None], limits)
+
+
+def _check_places(joints_rad: FloatArray, limits: Limits) -> FloatArray:
+    """Check where the arm is with joints (N, 6); return its tool points (N, K, 3) in base."""
+    body = kinematics.joint_origins(joints_rad)[:, 1:]
+    tool = _tool_points(joints_rad, limits.tool_points_in_tool0)
     _check_box(tool, limits)
     for keep_out in limits.keep_outs:
         _check_plane(body, keep_out, limits.body_radius_m)
         _check_plane(tool, keep_out, 0.0)
-    _check_rates(move, joints, tool, limits)
+    return tool
 
 
 def _check_caps(move: Move, limits: Limits) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from canopy_skel.frame import Float32Array, Intrinsics, StereoPair, UInt8Array, UInt16Array
 from canopy_skel.geometry import FloatArray, is_rigid
 from drivers.errors import (
+    ArmBusyError,
     ArmError,
     EmergencyStopError,
     MoveInterruptedError,
@@ -40,6 +41,7 @@ class ArmMode(Enum):
 
 
 _ERRORS: dict[ArmMode, type[ArmError]] = {
+    ArmMode.MOVING: ArmBusyError,
     ArmMode.INTERRUPTED: MoveInterruptedError,
     ArmMode.PROTECTIVE_STOP: ProtectiveStopError,
     ArmMode.SAFEGUARD_STOP: SafeguardStopError,
@@ -146,6 +148,15 @@ class Arm(Protocol):
         """Return the newest measurement; never an old one: ArmLinkError when there is none."""
         ...
 
+    def check(self) -> None:
+        """Raise what would keep the arm from beginning a move now; a move under way does not count.
+
+        Raises:
+            ArmStoppedError: the arm is held, or takes no commands; the message names the mend.
+            ArmLinkError: the arm cannot be asked.
+        """
+        ...
+
     def start_move(self, move: Move) -> None:
         """Begin a move and return; the mode is MOVING until it ends.
 
@@ -215,6 +226,13 @@ class Camera(Protocol):
         traceback: TracebackType | None,
     ) -> None:
         """Close the camera; harmless when repeated."""
+        ...
+
+    def check(self) -> None:
+        """Raise NoCameraError if the camera is known to be gone; returns at once.
+
+        One that is gone is tried anew, so a later call may find it back.
+        """
         ...
 
     def grab(self, timeout_s: float) -> CameraImage:

@@ -8,7 +8,7 @@ import numpy as np
 from canopy_skel.geometry import FloatArray
 from drivers import kinematics
 from drivers.errors import MoveRefusedError, UnreachableError
-from drivers.guarded_arm import Limits, check
+from drivers.guarded_arm import Limits, check, check_posture
 from drivers.protocols import ArmMode, ArmState, JointMove, LinearMove, Move, ToolPose
 
 JOINT_SPEEDS_RPS = (0.8, 0.4, 0.2, 0.1)
@@ -55,8 +55,8 @@ def move_to(
     """Return the move from `state` to a pose: straight if possible, else through the joints.
 
     Raises:
-        MoveRefusedError: neither is allowed; the reason is that of the straight one if the pose
-            can be reached at all.
+        MoveRefusedError: neither is allowed; the reason is that of the straight one if the arm can
+            be at the pose at all.
     """
     straight = LinearMove(
         base_from_tool0=base_from_tool0, speed_mps=speed_mps, acceleration_mps2=acceleration_mps2
@@ -76,8 +76,21 @@ def _turn_to(
         raise UnreachableError(str(refusal))
     move = _turn(state, solutions, limits)
     if move is None:
-        raise refusal
+        raise _why_not_there(solutions, limits) or refusal
     return move
+
+
+def _why_not_there(postures: list[FloatArray], limits: Limits) -> MoveRefusedError | None:
+    """Return why the arm must not be in the first of the postures, None if one is allowed."""
+    reasons = []
+    for joints in postures:
+        try:
+            check_posture(joints, limits)
+        except MoveRefusedError as error:
+            reasons.append(error)
+        else:
+            return None
+    return reasons[0]
 
 
 def _turn(state: ArmState, postures: list[FloatArray], limits: Limits) -> JointMove | None:

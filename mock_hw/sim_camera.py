@@ -87,11 +87,13 @@ class SimCamera:
         """All pictures drawn so far, retakes included, in order."""
         return tuple(self._exposures)
 
+    def check(self) -> None:
+        """Raise NoCameraError outside the `with` block."""
+        self._open_studio()
+
     def grab(self, timeout_s: float) -> CameraImage:
         """Return what is seen from the first pose measured after this call; see `Camera.grab`."""
-        studio = self._studio
-        if studio is None:
-            raise NoCameraError("the camera is not open: use it inside its `with` block")
+        studio = self._open_studio()
         until_s = time.perf_counter() + timeout_s
         pose = self._pose_after(time.monotonic_ns(), until_s)
         index, self._grabs = self._grabs, self._grabs + 1
@@ -117,6 +119,12 @@ class SimCamera:
             scan_id=self._simulation.scan_id,
             views=len(kept),
         )
+
+    def _open_studio(self) -> ThreadPoolExecutor:
+        studio = self._studio
+        if studio is None:
+            raise NoCameraError("the camera is not open: use it inside its `with` block")
+        return studio
 
     def _pose_after(self, called_ns: int, until_s: float) -> ToolPose:
         """Wait for a measurement that is newer than the call and than the last exposure."""

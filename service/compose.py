@@ -4,7 +4,7 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from service.catalogue import Catalogue
 from service.feeder import ScanSource, ViewFeeder
 from service.local_rig import LocalRig, RigParts
 from service.rig import PartStatus, ScanSpec
+from service.scan import Stage
 from service.supervisor import Supervised
 
 LIMITS = Limits(
@@ -65,12 +66,16 @@ class ServeOptions:
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """Arm and camera, the hand-eye calibration, and what a simulation knows beyond them."""
+    """Arm and camera, the hand-eye calibration, and what a simulation knows beyond them.
+
+    stage: entered around each step of a scan, for who wants to time it.
+    """
 
     arm: Arm
     camera: Camera
     tool_from_camera: FloatArray
     attachments: Callable[[], Mapping[str, bytes]]
+    stage: Stage = lambda name: nullcontext()
 
 
 class BusFeed:
@@ -134,6 +139,7 @@ def composed(
                 feed=BusFeed(feeder),
                 data=options.data,
                 attachments=hardware.attachments,
+                stage=hardware.stage,
             )
         )
 

@@ -140,9 +140,17 @@ class ViewFeeder:
             self._changed.notify_all()
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until every offered view has arrived and its skeleton is here; say whether so."""
+        """Wait until every offered view has arrived and its skeleton is here; say whether so.
+
+        Without a worker there is nothing to wait for.
+        """
+        until_s = time.monotonic() + timeout_s
         with self._changed:
-            return self._changed.wait_for(self._complete, timeout_s)
+            while not self._complete():
+                if not self._watch.workers() or time.monotonic() > until_s:
+                    return False
+                self._changed.wait(_TICK_S)
+        return True
 
     def workers(self) -> tuple[WorkerSeen, ...]:
         """Return the workers that are there now, as they last reported."""
@@ -273,7 +281,13 @@ class ViewFeeder:
 
     def _recorded(self, source: ScanSource, index: int) -> tuple[Message, ...]:
         """Read a view from the recording, which is looked through anew only if need be."""
-        path = source.recording()
+        try:
+            return self._read(source.recording(), index)
+        except RecordingError:
+            # The scan may just have ended, which renames its recording.
+            return self._read(source.recording(), index)
+
+    def _read(self, path: Path, index: int) -> tuple[Message, ...]:
         known = self._recording
         if known is None or known.path != path or index not in {g.index for g in known.groups}:
             known = self._recording = read_recording(path)

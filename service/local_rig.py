@@ -4,16 +4,17 @@ import logging
 import shutil
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from canopy_skel.geometry import FloatArray
-from drivers.errors import ArmError, ArmStoppedError, CameraError, DriverError, MoveRefusedError
+from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
-from drivers.protocols import Arm, ArmMode, Camera, ToolPose, raise_unless_movable
+from drivers.protocols import Arm, Camera, ToolPose
 from drivers.waypoints import after, moves_to
+from service.opened import Opened
 from service.rig import (
     FINISHED,
     PartStatus,
@@ -27,7 +28,7 @@ from service.rig import (
     UnknownScanError,
     WaypointVerdict,
 )
-from service.scan import ScanSession, ScanTools
+from service.scan import ScanSession, ScanTools, Stage
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +72,7 @@ class RigParts:
     feed: Feed
     data: Path
     attachments: Callable[[], Mapping[str, bytes]] = dict
+    stage: Stage = lambda name: nullcontext()
 
 
 class LocalRig:
@@ -79,17 +81,18 @@ class LocalRig:
     def __init__(self, parts: RigParts) -> None:
         self._parts = parts
         self._lock = threading.Lock()
+        self._arm, self._camera = Opened(parts.arm), Opened(parts.camera)
         self._open = ExitStack()
-        self._opened: set[str] = set()
         self._sessions: dict[str, tuple[ScanSpec, ScanSession]] = {}
-        self._stopped_reason: str | None = None
+        self._stopped = ""
         self._listeners: list[Callable[[RigEvent], None]] = []
 
     def __enter__(self) -> "LocalRig":
         """Open arm and camera as far as they are there; what is missing is told by `parts`."""
-        for name in ("arm", "camera"):
+        for name, device in (("arm", self._arm), ("camera", self._camera)):
+            self._open.enter_context(device)
             try:
-                self._ensure_open(name)
+                device.open()
             except DriverError as error:
                 log.warning("%s is not there yet: %s", name, error)
         return self
@@ -99,13 +102,19 @@ class LocalRig:
         for scan_id in [*self._sessions]:
             session = self._sessions[scan_id][1]
             if session.status.state is ScanState.RUNNING:
-                self._interrupt(session, ScanState.PAUSED)
+                try:
+                    self._interrupt(session, ScanState.PAUSED)
+                except RigNotReadyError as error:
+                    log.warning("scan %s: %s", scan_id, error)
         self._open.close()
 
     def plan(self, spec: ScanSpec) -> list[WaypointVerdict]:
         """Check every waypoint in order, from where the arm is; nothing moves."""
-        self._ensure_ready("arm")
-        state = self._parts.arm.state()
+        try:
+            self._arm.open()
+            state = self._parts.arm.state()
+        except DriverError as error:
+            raise _not_ready(error) from error
         verdicts = []
         for index, waypoint in enumerate(spec.waypoints):
             try:
@@ -128,7 +137,7 @@ class LocalRig:
         """Begin a scan; see `Rig.start`."""
         with self._lock:
             self._require_free()
-            self._require_startable()
+            self._require_ready()
             verdicts = self.plan(spec)
             if not all(verdict.reachable for verdict in verdicts):
                 bad = [v for v in verdicts if not v.reachable]
@@ -152,7 +161,7 @@ class LocalRig:
             if session.status.state in FINISHED:
                 raise RigNotReadyError(f"scan {scan_id} is {session.status.state}; start a new one")
             self._require_free()
-            self._require_startable()
+            self._require_ready()
             return self._launch(spec)
 
     def cancel(self, scan_id: str) -> ScanStatus:
@@ -164,21 +173,28 @@ class LocalRig:
 
     def stop(self) -> None:
         """Stop the arm now, whatever is under way; an acknowledgement is needed afterwards."""
-        self._stopped_reason = "stopped by the operator"
+        self._stopped = "the arm was stopped by the operator"
         running = [s for _, s in self._sessions.values() if s.status.state is ScanState.RUNNING]
-        if not running:
-            self._parts.arm.stop()
-        for session in running:
-            session.interrupt(ScanState.STOPPED)
+        try:
+            if not running:
+                self._parts.arm.stop()
+            for session in running:
+                session.interrupt(ScanState.STOPPED)
+        except DriverError as error:
+            raise _not_ready(error) from error
+
+    def hold(self, reason: str) -> None:
+        """Let nothing move until somebody has acknowledged; an earlier reason stays."""
+        self._stopped = self._stopped or reason
 
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again; a scan goes on only by `resume`."""
         try:
-            self._ensure_open("arm")
+            self._arm.open()
             self._parts.arm.acknowledge(reason)
-        except ArmError as error:
-            raise RigNotReadyError(f"{type(error).__name__}: {error}") from error
-        self._stopped_reason = None
+        except DriverError as error:
+            raise _not_ready(error) from error
+        self._stopped = ""
         self._tell("", "acknowledged", {"reason": reason})
 
     def status(self, scan_id: str) -> ScanStatus:
@@ -191,7 +207,7 @@ class LocalRig:
             if session.status.state is ScanState.RUNNING:
                 try:
                     return scan_id, self._parts.arm.state().pose
-                except ArmError:
+                except DriverError:
                     return None
         return None
 
@@ -242,20 +258,26 @@ class LocalRig:
                 limits=parts.limits,
                 tool_from_camera=parts.tool_from_camera,
                 attachments=parts.attachments,
+                stage=parts.stage,
             ),
             self._path(spec.scan_id),
             report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),
             recorded=lambda index: parts.feed.offer(spec.scan_id, index),
-            conclude_with=self._await_skeleton,
+            conclude_with=self._conclude,
         )
 
-    def _await_skeleton(self, state: ScanState) -> None:
-        """Let the last views become a skeleton before the scan is said to be done."""
+    def _conclude(self, state: ScanState, detail: str) -> None:
+        """Let the last views become a skeleton; hold the arm after what nobody asked for."""
         if state is ScanState.DONE and not self._parts.feed.flush(SKELETON_TIMEOUT_S):
             log.warning("the skeleton of the last views is not there yet")
+        if state in (ScanState.STOPPED, ScanState.FAILED) and detail:
+            self.hold(f"the scan was stopped ({detail})")
 
     def _interrupt(self, session: ScanSession, wanted: ScanState) -> None:
-        session.interrupt(wanted)
+        try:
+            session.interrupt(wanted)
+        except DriverError as error:
+            raise _not_ready(error) from error
         if not session.join(STOP_TIMEOUT_S):
             raise RigNotReadyError(
                 "the arm was told to stop but the scan has not ended within"
@@ -277,50 +299,20 @@ class LocalRig:
                     f"scan {spec.scan_id} is under way; wait for it, or pause or cancel it"
                 )
 
-    def _require_startable(self) -> None:
-        if self._stopped_reason:
-            raise RigNotReadyError(
-                f"the arm was {self._stopped_reason}: look at it, then acknowledge with a reason"
-            )
-        self._ensure_ready("arm")
-        self._ensure_ready("camera")
-        for part in (self._arm_status(), self._disk_status()):
+    def _require_ready(self) -> None:
+        for part in (self._arm_status(), self._camera_status(), self._disk_status()):
             if not part.ready:
                 raise RigNotReadyError(f"{part.name}: {part.detail}")
 
-    def _ensure_ready(self, name: str) -> None:
-        try:
-            self._ensure_open(name)
-        except DriverError as error:
-            raise RigNotReadyError(f"{name}: {type(error).__name__}: {error}") from error
-
-    def _ensure_open(self, name: str) -> None:
-        if name not in self._opened:
-            self._open.enter_context(getattr(self._parts, name))
-            self._opened.add(name)
-
     def _arm_status(self) -> PartStatus:
-        try:
-            self._ensure_open("arm")
-            raise_unless_movable(
-                self._parts.arm.state(), also=(ArmMode.MOVING, ArmMode.INTERRUPTED)
-            )
-        except ArmStoppedError as error:
-            return PartStatus(name="arm", ready=False, detail=f"{error}; mend it, then acknowledge")
-        except ArmError as error:
-            return PartStatus(name="arm", ready=False, detail=f"{type(error).__name__}: {error}")
-        if self._stopped_reason:
-            return PartStatus(
-                name="arm", ready=False, detail=f"{self._stopped_reason}; acknowledge"
-            )
-        return PartStatus(name="arm", ready=True)
+        detail = _trouble(self._arm)
+        if not detail and self._stopped:
+            detail = f"{self._stopped}: look at the arm, then acknowledge with a reason"
+        return PartStatus(name="arm", ready=not detail, detail=detail)
 
     def _camera_status(self) -> PartStatus:
-        try:
-            self._ensure_open("camera")
-        except CameraError as error:
-            return PartStatus(name="camera", ready=False, detail=str(error))
-        return PartStatus(name="camera", ready=True)
+        detail = _trouble(self._camera)
+        return PartStatus(name="camera", ready=not detail, detail=detail)
 
     def _disk_status(self) -> PartStatus:
         self._parts.data.mkdir(parents=True, exist_ok=True)
@@ -332,3 +324,18 @@ class LocalRig:
         event = RigEvent(scan_id=scan_id, kind=kind, fields=fields)
         for listener in self._listeners:
             listener(event)
+
+
+def _not_ready(error: DriverError) -> RigNotReadyError:
+    return RigNotReadyError(f"arm: {type(error).__name__}: {error}")
+
+
+def _trouble(device: Opened) -> str:
+    """Return why a device cannot be used and how to mend it, nothing if it can."""
+    try:
+        device.check()
+    except NotAcknowledgedError as error:
+        return f"{error}; look at the arm, then acknowledge with a reason"
+    except DriverError as error:
+        return f"{type(error).__name__}: {error}"
+    return ""

@@ -138,6 +138,10 @@ class Rig(Protocol):
         """Stop the arm now; never queued, harmless when repeated."""
         ...
 
+    def hold(self, reason: str) -> None:
+        """Let nothing move until somebody has acknowledged; the reason is a short sentence."""
+        ...
+
     def acknowledge(self, reason: str) -> None:
         """An operator has looked and says why moving is safe again. Raises RigNotReadyError."""
         ...

@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,6 +36,7 @@ from service.rig import ScanSpec, ScanState, ScanStatus
 log = logging.getLogger(__name__)
 
 Report = Callable[[str, dict[str, object]], None]
+Stage = Callable[[str], AbstractContextManager[None]]
 
 
 class ScanInterruptedError(Exception):
@@ -50,7 +52,7 @@ class ScanTools:
     """What a scan works with.
 
     tool_from_camera: (4, 4), the hand-eye calibration. attachments: files that go with the finished
-    recording, by name; of a simulation the truth.
+    recording, by name; of a simulation the truth. stage: entered around each step, by its name.
     """
 
     arm: Arm
@@ -59,14 +61,15 @@ class ScanTools:
     tool_from_camera: FloatArray
     quality: QualityLimits = field(default_factory=QualityLimits)
     attachments: Callable[[], Mapping[str, bytes]] = dict
+    stage: Stage = lambda name: nullcontext()
 
 
 class ScanSession:
     """Drives one scan from where it is to its end, or until it is interrupted or stopped.
 
     `report(kind, fields)` is told of everything that happens, from the session's thread;
-    `recorded(index)` that a view is safe on disk; `conclude_with(state)` is called before the scan
-    is said to have ended.
+    `recorded(index)` that a view is safe on disk; `conclude_with(state, detail)` is called before
+    the scan is said to have ended, and when nothing moves any more.
     """
 
     def __init__(
@@ -77,7 +80,7 @@ class ScanSession:
         *,
         report: Report,
         recorded: Callable[[int], None],
-        conclude_with: Callable[[ScanState], None] = lambda state: None,
+        conclude_with: Callable[[ScanState, str], None] = lambda state, detail: None,
     ) -> None:
         self.path = path
         self._spec = spec
@@ -140,13 +143,22 @@ class ScanSession:
         except ScanInterruptedError:
             self._end(self._wanted or ScanState.PAUSED, "")
         except (DriverError, CanopyError, PictureRefusedError) as error:
-            # An interruption makes the driver complain of the move it cut short.
-            interrupted = self._wanted is not None
-            state = (self._wanted or ScanState.STOPPED) if interrupted else ScanState.STOPPED
-            self._end(state, "" if interrupted else f"{type(error).__name__}: {error}")
+            if self._wanted is None:
+                self._end(ScanState.STOPPED, self._drop_motion(error))
+            else:  # the interruption makes the driver complain of the move it cut short
+                self._end(self._wanted, "")
         except Exception as error:
             log.exception("scan %s failed", self._spec.scan_id)
-            self._end(ScanState.FAILED, f"{type(error).__name__}: {error}")
+            self._end(ScanState.FAILED, self._drop_motion(error))
+
+    def _drop_motion(self, error: Exception) -> str:
+        """Stop the arm, whatever the error left of a move; return what the operator must know."""
+        detail = f"{type(error).__name__}: {error}"
+        try:
+            self._tools.arm.stop()
+        except DriverError as unstopped:
+            return f"{detail}; {unstopped}"
+        return detail
 
     def _scan(self) -> None:
         metadata = {"scan_id": self._spec.scan_id, "tree_id": self._spec.tree_id}
@@ -172,53 +184,61 @@ class ScanSession:
         self._end(ScanState.DONE, "")
 
     def _visit_all(self, writer: RecordingWriter) -> None:
+        stage = self._tools.stage
         for index, waypoint in enumerate(self._spec.waypoints):
             if index in self._done:
                 continue
             self._check_wanted()
             state = self._drive_to(waypoint)
             view = self._capture(index, state, writer)
-            writer.write_view(view)
+            with stage("record"):
+                writer.write_view(view)
             with self._lock:
                 self._done.add(index)
-            self._recorded(index)
-            self._note(writer, "view", index=index)
+            with stage("bus"):
+                self._recorded(index)
+            with stage("journal"):
+                self._note(writer, "view", index=index)
 
     def _drive_to(self, waypoint: FloatArray) -> ArmState:
-        arm, spec = self._tools.arm, self._spec
-        state = arm.state()
-        raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
-        moves = moves_to(
-            state,
-            waypoint,
-            self._tools.limits,
-            speed_mps=spec.speed_mps,
-            acceleration_mps2=spec.acceleration_mps2,
-        )
+        arm, spec, stage = self._tools.arm, self._spec, self._tools.stage
+        with stage("plan"):
+            state = arm.state()
+            raise_unless_movable(state, also=(ArmMode.INTERRUPTED,))
+            moves = moves_to(
+                state,
+                waypoint,
+                self._tools.limits,
+                speed_mps=spec.speed_mps,
+                acceleration_mps2=spec.acceleration_mps2,
+            )
         for move in moves:
-            with self._lock:
+            with stage("command"), self._lock:
                 self._check_wanted()
                 arm.start_move(move)
-            state = wait_settled(arm, timeout_s=spec.settle_timeout_s)
+            with stage("settle"):
+                state = wait_settled(arm, timeout_s=spec.settle_timeout_s)
         return state
 
     def _capture(self, index: int, before: ArmState, writer: RecordingWriter) -> View:
         reasons: list[str] = []
         for attempt in range(self._spec.retakes + 1):
             self._check_wanted()
-            image = self._tools.camera.grab(self._spec.grab_timeout_s)
-            after = self._tools.arm.state()
-            shift = moved(
-                before.pose.base_from_tool0, after.pose.base_from_tool0, self._tools.quality
-            )
-            reasons = [*flaws(image, self._tools.quality), *([shift] if shift else [])]
+            with self._tools.stage("grab"):
+                image = self._tools.camera.grab(self._spec.grab_timeout_s)
+            with self._tools.stage("gate"):
+                after = self._tools.arm.state()
+                shift = moved(
+                    before.pose.base_from_tool0, after.pose.base_from_tool0, self._tools.quality
+                )
+                reasons = [*flaws(image, self._tools.quality), *([shift] if shift else [])]
             if not reasons:
                 return self._view(index, image, after)
             self._note(writer, "retake", index=index, attempt=attempt, reasons=reasons)
             before = after
         raise PictureRefusedError(
             f"waypoint {index}: {'; '.join(reasons)}; clean the lens, light the tree or move the"
-            " waypoint, then resume"
+            " waypoint, then acknowledge and resume"
         )
 
     def _view(self, index: int, image: CameraImage, state: ArmState) -> View:
@@ -243,7 +263,7 @@ class ScanSession:
         self._report(kind, fields)
 
     def _end(self, state: ScanState, detail: str) -> None:
-        self._conclude_with(state)
+        self._conclude_with(state, detail)
         with self._lock:
             self._state, self._detail = state, detail
         self._report(str(state), {"detail": detail} if detail else {})

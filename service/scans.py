@@ -58,6 +58,7 @@ class Scans:
         """Recover the catalogue and follow the rig."""
         for scan_id in self.catalogue.recover():
             logger.warning("scan was under way when the service ended scan_id=%s", scan_id)
+            self._rig.hold(f"the service ended during scan {scan_id}")
             self._add_event(self.record(scan_id).status, "interrupted", {})
         self._rig.subscribe(self._events.put)
         self._journal.start()

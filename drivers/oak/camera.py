@@ -1,6 +1,7 @@
 """An OAK-D as a Camera. depthai may block, abort or lose the device: that ends a child, not us."""
 
 import logging
+import math
 import sys
 import threading
 import time
@@ -17,6 +18,8 @@ from drivers.protocols import CameraImage
 log = logging.getLogger(__name__)
 
 _PAUSE_S = 0.3
+_RETRY_S = 2.0
+_NOT_OPEN = "the camera is not open: use it inside its `with` block"
 _COMMAND = (sys.executable, "-m", "drivers.oak.child")
 
 
@@ -36,6 +39,8 @@ class OakCamera:
         self._command = command
         self._grabbing = threading.Lock()
         self._process: CameraProcess | None = None
+        self._started_s = -math.inf
+        self._why = NoCameraError("the camera is starting: wait for it")
         self._open = False
         self._number = 0
         self._newest_ns = 0
@@ -47,11 +52,11 @@ class OakCamera:
             NoCameraError: no device, no depthai, or it does not start; nothing is left open.
         """
         self._open = True
-        self._process = CameraProcess(self._config, self._command)
+        process = self._start()
         until_s = time.perf_counter() + self._config.open_timeout_s
         try:
-            while not self._process.ready:
-                self._process.hear(until_s)
+            while not process.ready:
+                process.hear(until_s)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -80,6 +85,36 @@ class OakCamera:
         """Return the process id of the present child."""
         return self._process.pid if self._process else None
 
+    def check(self) -> None:
+        """Raise NoCameraError if the device is gone; its process is started again by and by.
+
+        While another thread grabs, that thread finds out.
+        """
+        if not self._open:
+            raise NoCameraError(_NOT_OPEN)
+        if self._grabbing.acquire(blocking=False):
+            try:
+                self._check()
+            finally:
+                self._grabbing.release()
+
+    def _check(self) -> None:
+        process = self._process
+        if process is None:
+            if time.perf_counter() - self._started_s < _RETRY_S:
+                raise NoCameraError(str(self._why))
+            process = self._start()
+        try:
+            while process.hear(time.perf_counter()) is not None:
+                pass
+        except NoCameraError as error:
+            self._lose(error)
+            raise
+        if not process.ready:
+            raise NoCameraError(str(self._why))
+        if process.owes:
+            raise NoCameraError("the last picture has not come yet: look at cable and light")
+
     def grab(self, timeout_s: float) -> CameraImage:
         """Return a picture no part of which was exposed before this call; see `Camera.grab`.
 
@@ -102,9 +137,8 @@ class OakCamera:
             try:
                 image = self._ask(Grab(self._next(), not_before_ns), until_s)
             except NoCameraError as error:
-                log.warning("camera: %s", error)
                 why = error
-                self._bury(kindly=False)
+                self._lose(error)
                 if time.perf_counter() + _PAUSE_S > until_s:
                     raise
                 time.sleep(_PAUSE_S)
@@ -115,13 +149,11 @@ class OakCamera:
             raise why or CameraTimeoutError(
                 f"no picture within {timeout_s} s; look at cable and light, or allow more time"
             )
-        raise NoCameraError("the camera is not open: use it inside its `with` block")
+        raise NoCameraError(_NOT_OPEN)
 
     def _ask(self, grab: Grab, until_s: float) -> CameraImage | None:
         """Return the picture, None if it does not come in time; start a child if there is none."""
-        if self._process is None:
-            self._process = CameraProcess(self._config, self._command)
-        process, asked = self._process, False
+        process, asked = self._process or self._start(), False
         while True:
             if process.ready and not asked:
                 process.ask(grab)
@@ -135,6 +167,16 @@ class OakCamera:
     def _next(self) -> int:
         self._number += 1
         return self._number
+
+    def _start(self) -> CameraProcess:
+        self._process = CameraProcess(self._config, self._command)
+        self._started_s = time.perf_counter()
+        return self._process
+
+    def _lose(self, error: NoCameraError) -> None:
+        log.warning("camera: %s", error)
+        self._why = error
+        self._bury(kindly=False)
 
     def _bury(self, *, kindly: bool) -> None:
         process, self._process = self._process, None

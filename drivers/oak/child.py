@@ -7,7 +7,6 @@ One thread: if depthai blocks, the beats stop, and the parent ends this process.
 """
 
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -31,7 +30,6 @@ class NoDeviceError(Exception):
 
 def main(pipe: Connection) -> NoReturn:
     """Serve the parent until it goes away."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     config: OakConfig = pipe.recv()
     try:
         device = find_device(config.device)

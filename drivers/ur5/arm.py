@@ -106,6 +106,12 @@ class Ur5Arm:
             detail=detail,
         )
 
+    def check(self) -> None:
+        """Raise what keeps the arm from moving, local control too; see `Arm.check`."""
+        sample, _ = self._fresh()
+        raise_unless_movable(self.state(), also=(ArmMode.MOVING, ArmMode.INTERRUPTED))
+        self._require_remote_control(sample)
+
     def start_move(self, move: Move) -> None:
         """Begin a move after checking that the arm can follow it; see `Arm.start_move`."""
         stops = self._stops
@@ -141,7 +147,8 @@ class Ur5Arm:
             pending = link.post(Stop())
             self._stopped_move = self._move
         if pending.wait(self._config.stop_timeout_s) is None:
-            link.kill()
+            if link.up:
+                link.kill("did not confirm a stop and was ended")
             try:
                 self._dashboard.ask("stop")
             except OSError as error:
@@ -151,8 +158,11 @@ class Ur5Arm:
                 ) from error
 
     def acknowledge(self, reason: str) -> None:
-        """Unlock, power and release the arm after a stop; see `Arm.acknowledge`."""
-        sample, _ = self._fresh()
+        """Unlock, power and release the arm after a stop; see `Arm.acknowledge`.
+
+        A controller that has just come back is waited for, so that one acknowledgement is enough.
+        """
+        sample = self._returned()
         if not (self._latch or safety_hold(sample) or power_hold(sample)):
             return
         log.info("%s: acknowledged: %s", self._config.host, reason)
@@ -189,21 +199,30 @@ class Ur5Arm:
         return self._link
 
     def _prepare(self, sample: Sample) -> None:
-        """Have the control script run; uploading it takes a robot in remote control."""
-        if not sample.tcp_is_flange and self._in_local_control():
-            raise NotInRemoteControlError("switch the controller to remote control")
+        """Have the control script run."""
+        self._require_remote_control(sample)
         reply = self._connected().post(Prepare()).wait(self._config.connect_timeout_s)
         if reply is None:
             raise self._give_up("did not get the control script to run")
         if reply.refusal:
             raise self._why_refused(reply.refusal)
 
-    def _in_local_control(self) -> bool:
-        """Ask the dashboard; controllers before 5.6 do not know the question."""
+    def _require_remote_control(self, sample: Sample) -> None:
+        """Refuse local control while our script does not run: it could not be uploaded.
+
+        Controllers before 5.6 do not know the question.
+        """
+        if sample.tcp_is_flange:
+            return
         try:
-            return self._dashboard.ask("is in remote control") == "false"
+            answer = self._dashboard.ask("is in remote control")
         except OSError as error:
             raise NotConnectedError(f"{self._config.host} does not answer: {error}") from error
+        if answer == "false":
+            raise NotInRemoteControlError(
+                "local control, commands from the pendant only: switch the controller to remote"
+                " control"
+            )
 
     def _why_refused(self, refusal: str) -> ArmError:
         time.sleep(_LAG_S)
@@ -217,7 +236,7 @@ class Ur5Arm:
         """Replace a child that does not answer; the program on the controller is ended."""
         link = self._connected()
         if link.up:
-            link.kill()
+            link.kill(f"{what} and was ended")
             return DriverProcessError(f"the arm's driver process {what} and was ended")
         return link.why_down()
 
@@ -289,6 +308,17 @@ class Ur5Arm:
         raise ControllerFrozenError(
             f"{self._config.host} has sent nothing for {self._config.stale_after_s} s"
         )
+
+    def _returned(self) -> Sample:
+        """Return a fresh sample, waiting a while for a lost link to be there again."""
+        until_s = time.perf_counter() + self._config.return_timeout_s
+        while True:
+            try:
+                return self._fresh()[0]
+            except ArmLinkError:
+                if self._link is None or time.perf_counter() > until_s:
+                    raise
+                time.sleep(_LAG_S)
 
     def _wait(self, wanted: Callable[[Sample], bool], timeout_s: float) -> bool:
         until_s = time.perf_counter() + timeout_s

@@ -10,7 +10,6 @@ thread owns the receive interface, sends every package to the parent and ends th
 """
 
 import os
-import signal
 import socket
 import struct
 import sys
@@ -45,15 +44,15 @@ def probe(host: str, timeout_s: float = 1.0) -> tuple[str, str] | None:
                 if port != 30003 and not link.recv(1):
                     return ("LinkLostError", f"{host} closed port {port}")
     except TimeoutError:
-        return ("ControllerFrozenError", f"{host} does not answer on port {port}")
+        return ("ControllerFrozenError", f"{host} does not answer on port {port}: see the pendant")
     except OSError as error:
-        return ("NotConnectedError", f"no UR controller at {host}, port {port}: {error.strerror}")
+        where = f"{host}, port {port} ({error.strerror})"
+        return ("NotConnectedError", f"no UR controller at {where}: check address, cable and power")
     return None
 
 
 def main(pipe: Connection) -> NoReturn:
     """Serve the parent until it goes away."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     config: Ur5Config = pipe.recv()
     parent, record = Parent(pipe), MoveRecord()
     problem = probe(config.host)

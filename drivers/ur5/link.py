@@ -1,15 +1,11 @@
 """The parent's side of the arm's child process: starts it, listens to it, replaces it."""
 
-import os
-import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 
 from drivers import errors
+from drivers.child import Child
 from drivers.errors import ArmLinkError, DriverProcessError, NotConnectedError
 from drivers.ur5.messages import (
     Answer,
@@ -22,7 +18,9 @@ from drivers.ur5.messages import (
     Ur5Config,
 )
 
+_COMMAND = (sys.executable, "-m", "drivers.ur5.child")
 _SILENCE_S = 1.0
+_LEAVE_S = 2.0
 _BACKOFF_S = (0.05, 0.2, 0.5, 1.0)
 
 
@@ -58,12 +56,12 @@ class ChildLink:
         self._on_down = on_down
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
-        self._pipe: Connection | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: Child | None = None
         self._pending: dict[int, Pending] = {}
         self._number = 0
         self._up = False
         self._down: ArmLinkError | None = None
+        self._why_killed = ""
         self._closing = threading.Event()
         self._supervisor = threading.Thread(target=self._supervise, name="ur5-link", daemon=True)
 
@@ -101,7 +99,7 @@ class ChildLink:
     @property
     def pid(self) -> int | None:
         """Return the process id of the present child."""
-        return self._process.pid if self._process else None
+        return self._child.pid if self._child else None
 
     def why_down(self) -> ArmLinkError:
         """Return why there is no connection."""
@@ -112,70 +110,56 @@ class ChildLink:
         with self._lock:
             self._number += 1
             pending = Pending(self._number)
-            if self._pipe is None or not self._up:
+            if self._child is None or not self._up:
                 pending.settle(None)
                 return pending
             self._pending[self._number] = pending
-            try:
-                self._pipe.send(Command(self._number, request))
-            except OSError:
-                self._pending.pop(self._number).settle(None)
+            self._child.send(Command(self._number, request))
         return pending
 
-    def kill(self) -> None:
+    def kill(self, why: str = "") -> None:
         """End the present child without asking it; another is started unless closing."""
-        process = self._process
-        if process is not None and process.poll() is None:
-            process.send_signal(signal.SIGKILL)
+        child = self._child
+        if child is not None:
+            self._why_killed = why
+            child.kill()
 
     def _supervise(self) -> None:
         failures = 0
         while not self._closing.is_set():
-            pipe = self._spawn()
-            down = self._listen(pipe)
+            child = self._spawn()
+            down = self._listen(child)
             failures = 0 if self._up else failures + 1
-            self._bury(pipe, down)
+            self._bury(child, down)
             if not self._closing.is_set():
                 self._on_down(down)
                 self._closing.wait(_BACKOFF_S[min(failures, len(_BACKOFF_S) - 1)])
 
-    def _spawn(self) -> Connection:
-        ours, theirs = Pipe()
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "drivers.ur5.child", str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                env=environment,
-            )
-        self._pipe = ours
+    def _spawn(self) -> Child:
+        child = self._child = Child(_COMMAND)
+        self._why_killed = ""
         if self._closing.is_set():
-            self.kill()
-        else:
-            ours.send(self._config)
-        return ours
+            child.kill()
+        child.send(self._config)
+        return child
 
-    def _listen(self, pipe: Connection) -> ArmLinkError:
+    def _listen(self, child: Child) -> ArmLinkError:
         """Take what the child says until it ends or falls silent; return why."""
         patience_s = self._config.connect_timeout_s
         while True:
             try:
-                if not pipe.poll(patience_s):
-                    self.kill()
+                if not child.pipe.poll(patience_s):
                     return DriverProcessError("the arm's driver process hung and was ended")
-                answer: Answer = pipe.recv()
+                answer: Answer = child.pipe.recv()
             except (EOFError, OSError):
-                return self._died()
+                code = child.exit_code(_LEAVE_S)
+                why = self._why_killed or f"died (exit code {code})"
+                return DriverProcessError(f"the arm's driver process {why}")
             if isinstance(answer, Farewell):
                 cause: type[ArmLinkError] = getattr(errors, answer.error)
                 return cause(answer.text)
             patience_s = _SILENCE_S
             self._take(answer)
-
-    def _died(self) -> ArmLinkError:
-        code = self._process.wait() if self._process else None
-        return DriverProcessError(f"the arm's driver process died (exit code {code})")
 
     def _take(self, answer: Answer) -> None:
         if isinstance(answer, Sample):
@@ -190,16 +174,13 @@ class ChildLink:
             if pending is not None:
                 pending.settle(answer)
 
-    def _bury(self, pipe: Connection, down: ArmLinkError) -> None:
-        self.kill()
-        if self._process is not None:
-            self._process.wait()
+    def _bury(self, child: Child, down: ArmLinkError) -> None:
+        child.kill()
         with self._changed:
             self._up, self._down = False, down
-            self._pipe = None
             orphans = list(self._pending.values())
             self._pending.clear()
             self._changed.notify_all()
-        pipe.close()
+        child.end(_LEAVE_S)
         for pending in orphans:
             pending.settle(None)

@@ -30,7 +30,8 @@ class Ur5Config:
     host: address of the controller. payload_kg, payload_cog_m: what the flange carries.
     watchdog_hz: the controller stops by itself when it hears less often than this.
     stale_after_s: a measurement older than this is never returned. stop_timeout_s: how long a
-    stop may go unanswered before the dashboard is used instead.
+    stop may go unanswered before the dashboard is used instead. return_timeout_s: how long
+    `acknowledge` waits for a lost controller that is coming back.
     """
 
     host: str
@@ -43,6 +44,7 @@ class Ur5Config:
     stop_timeout_s: float = 0.5
     script_timeout_s: float = 5.0
     power_timeout_s: float = 40.0
+    return_timeout_s: float = 5.0
     stop_deceleration_mps2: float = 1.0
     stop_deceleration_rps2: float = 2.0
 

@@ -90,7 +90,9 @@ class Watch:
         spoken_s = 0.0
         while True:
             if not self._receive.isConnected():
-                self._parent.end("LinkLostError", "the RTDE connection broke")
+                self._parent.end(
+                    "LinkLostError", "the link to the controller broke: check cable and power"
+                )
             now_s = time.monotonic()
             if self._receive.getTimestamp() != self.newest.stamp_s:
                 self.newest = self._sample()

@@ -30,6 +30,7 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--version", type=_version, default="3.15", help="PolyScope: 3.15 or 5.x")
     parser.add_argument("--time-scale", type=float, default=1.0, help="how much faster it moves")
     parser.add_argument("--fault-port", type=int, default=0, help="0: any free port")
+    parser.add_argument("--parent", type=int, help="descriptor of a pipe: end when it is closed")
     arguments = parser.parse_args(argv)
     if arguments.time_scale <= 0:
         parser.error("--time-scale must be above 0")
@@ -44,6 +45,8 @@ async def _run(arguments: argparse.Namespace) -> None:
     stopped = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    if arguments.parent is not None:
+        asyncio.get_running_loop().add_reader(arguments.parent, stopped.set)
     try:
         await network.listen(dashboard.PORT, dashboard.Dashboard(controller, network).serve)
         for port in upload.PORTS:
@@ -57,12 +60,17 @@ async def _run(arguments: argparse.Namespace) -> None:
     sys.stdout.flush()
     _start_cycle(controller, network, streams)
     await stopped.wait()
+    if arguments.parent is not None:
+        asyncio.get_running_loop().remove_reader(arguments.parent)
     await network.close()
     await control.close()
 
 
 def _start_cycle(controller: Controller, network: Network, streams: rtde.RtdeServer) -> None:
-    """Tick at the controller's rate; cycles missed on a busy host are made up for at once."""
+    """Tick as often as somebody looks, at the controller's rate at most.
+
+    Cycles in between, and those missed on a busy host, are made up for at once.
+    """
     loop = asyncio.get_running_loop()
     start_s = loop.time()
 
@@ -72,7 +80,8 @@ def _start_cycle(controller: Controller, network: Network, streams: rtde.RtdeSer
             controller.tick(due - controller.cycle)
             if not network.frozen:
                 streams.stream()
-        loop.call_at(start_s + (controller.cycle + 1) * controller.period_s, cycle)
+        next_s = controller.cycle * controller.period_s + streams.shortest_period_s()
+        loop.call_at(start_s + next_s, cycle)
 
     cycle()
 

@@ -102,6 +102,7 @@ class Controller:
         self.output_ints = [0] * REGISTERS
         self.output_doubles = [0.0] * REGISTERS
         self.watchdog: Watchdog | None = None
+        self.moving_s = 0.0
         self._scaled_s = 0.0
         self._stopped_at_s = 0.0
         self._later: list[tuple[float, Callable[[], None]]] = []
@@ -299,6 +300,8 @@ class Controller:
             if not program.step() and self.program is program:
                 self.stop_program()
         self._move(elapsed_s * self.speed_slider)
+        if not self.steady:
+            self.moving_s += cycles * self.period_s
 
     def _move(self, elapsed_s: float) -> None:
         if self.motion is None or self.motion.done or elapsed_s <= 0.0:

@@ -63,6 +63,7 @@ class FaultServer:
             "safety_mode": controller.safety_mode.name,
             "runtime_state": controller.runtime_state.name,
             "moving": not controller.steady,
+            "moving_s": controller.moving_s,
             "joints_rad": controller.joints.tolist(),
             "tcp_pose": list(controller.tcp_pose),
             "payload_kg": controller.payload_kg,

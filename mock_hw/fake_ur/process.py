@@ -1,16 +1,16 @@
 """Start a fake controller in a process of its own, and do things to it through its fault port."""
 
 import json
-import os
 import random
-import signal
 import socket
-import subprocess
 import sys
 from types import TracebackType
 from typing import Any, Self
 
+from drivers.child import Child
 from mock_hw.fake_ur import dashboard
+
+_LEAVE_S = 5.0
 
 
 def free_host() -> str:
@@ -32,8 +32,8 @@ class FakeUr:
     def __init__(self, host: str, *, version: str = "3.15", time_scale: float = 1.0) -> None:
         self.host = host
         self._command = [sys.executable, "-m", "mock_hw.fake_ur", "--host", host]
-        self._command += ["--version", version, "--time-scale", str(time_scale)]
-        self._process: subprocess.Popen[str] | None = None
+        self._command += ["--version", version, "--time-scale", str(time_scale), "--parent"]
+        self._child: Child | None = None
         self._fault_port = 0
 
     def __enter__(self) -> Self:
@@ -42,15 +42,8 @@ class FakeUr:
         Raises:
             RuntimeError: it ended instead, for example because the address is taken.
         """
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        self._process = subprocess.Popen(
-            self._command,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-            start_new_session=True,
-        )
-        line = self._process.stdout.readline() if self._process.stdout else ""
+        self._child = Child(self._command, captured=True)
+        line = self._child.output.readline().decode()
         if not line.startswith("ready"):
             self.close()
             raise RuntimeError(f"the fake controller did not start on {self.host}: {line!r}")
@@ -82,21 +75,13 @@ class FakeUr:
         return state
 
     def kill(self) -> None:
-        """End the process without warning, as a power cut would."""
-        if self._process is not None:
-            self._process.send_signal(signal.SIGKILL)
-            self._process.wait()
+        """End the process without warning, as a power cut would; entering starts another."""
+        if self._child is not None:
+            self._child.kill()
+            self.close()
 
     def close(self) -> None:
         """End the process; does nothing when it has ended already."""
-        if self._process is None:
-            return
-        self._process.terminate()
-        try:
-            self._process.wait(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-        self._process = None
+        child, self._child = self._child, None
+        if child is not None:
+            child.end(_LEAVE_S)

@@ -86,6 +86,11 @@ class RtdeServer:
         finally:
             self._clients.remove(client)
 
+    def shortest_period_s(self) -> float:
+        """Return how often a client wants outputs; as often as possible while none has started."""
+        periods_s = (client.output_period_s for client in self._clients if client.started)
+        return min(periods_s, default=self._controller.period_s)
+
     def stream(self) -> None:
         """Send the outputs of this control cycle to every client whose turn it is."""
         now_s = self._controller.stamp_s

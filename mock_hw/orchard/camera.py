@@ -44,12 +44,13 @@ def scaled(camera: Camera, scale: float) -> Camera:
     """Return the camera with pictures of another size that show the same.
 
     Raises:
-        UsageError: the scale leaves no picture.
+        UsageError: the scale leaves no picture, or is more than 1.
     """
     one = camera.intrinsics
-    width_px, height_px = round(scale * one.width_px), round(scale * one.height_px)
-    if width_px < 1 or height_px < 1:
-        raise UsageError(f"a camera scaled by {scale} has no pixels; give more than 0, up to 1")
+    size_px = scale * one.width_px, scale * one.height_px
+    if not (0 < scale <= 1 and min(size_px) >= 1):
+        raise UsageError(f"no pictures scaled by {scale}; give more than 0, up to 1")
+    width_px, height_px = map(round, size_px)
     across, down = width_px / one.width_px, height_px / one.height_px
     # Pixel centres are at whole numbers, so the picture's corner is at -0.5.
     return replace(
@@ -101,7 +102,8 @@ def shoot(
     fragments = fragments_in(scene, picture, base_from_camera, intrinsics)
     instances, scores = instances_of(fragments, rng)
     right_pose = base_from_camera @ transform_from(np.eye(3), [camera.baseline_m, 0, 0])
-    right = renderer.draw(scene.mesh, right_pose, intrinsics)
+    both = camera.depth or camera.pair
+    right = renderer.draw(scene.mesh, right_pose, intrinsics) if both else picture
     view = View(
         index=index,
         stamp_ns=stamp_ns,

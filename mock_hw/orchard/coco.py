@@ -1,150 +1,208 @@
 """Training images for a branch segmenter, as a COCO data set.
 
-Every fragment a network should find is an annotation with polygons; wood too small for that is
-one `iscrowd` region per image, to be ignored. Trees, leaves, light and camera are drawn anew.
+Every fragment a network should find is an annotation with polygons and a score; wood too small for
+that is one `iscrowd` region per image, to be ignored. Each image has a label file of its own, so
+that the work can be stopped and gone on with; `annotations.json` is put together at the end.
 """
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import cv2
-import numpy as np
 
-from canopy_skel.frame import UInt8Array
-from canopy_skel.geometry import BoolArray, FloatArray, transform_from
-from mock_hw.orchard.camera import Camera, Shot, shoot
-from mock_hw.orchard.foliage import MOST_LEAVES
-from mock_hw.orchard.light import any_weather
-from mock_hw.orchard.path import look_at
-from mock_hw.orchard.presets import SPECIES
-from mock_hw.orchard.scene import Scene, build_scene
-from mock_hw.orchard.tree import TRUNK_X_M, grow
+from canopy_skel.errors import RecordingError, UsageError
+from mock_hw.orchard.camera import Camera, scaled
+from mock_hw.orchard.files import write_whole
+from mock_hw.orchard.outlines import box, polygons, run_lengths
+from mock_hw.orchard.presets import species_named
+from mock_hw.orchard.training import FRAMES_PER_SCENE, Frame, scene_frames
+from mock_hw.orchard.workers import alone_in, require_jobs, workers
 
-FRAMES_PER_SCENE = 4
 BRANCH = 1
+ANNOTATIONS = "annotations.json"
 _JPEG_QUALITY = 95
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
-class Frame:
-    """One training image: color_rgb (H, W, 3), the instance masks, their scores, what to ignore."""
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingSet:
+    """What the images of a folder have in common: image k follows from these and k alone."""
 
-    color_rgb: UInt8Array
-    masks: list[BoolArray]
-    scores: tuple[float, ...]
-    ignore: BoolArray
+    seed: int = 0
+    species: tuple[str, ...] = ("apple", "oak", "walnut")
+    picture_scale: float = 1.0
+    software: str = ""
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields as they come back from JSON."""
+        return {**asdict(self), "species": list(self.species)}
 
 
-def training_frames(count: int, *, seed: int, camera: Camera | None = None) -> Iterator[Frame]:
-    """Yield training images; the same seed and camera give the same images."""
-    lens = replace(camera or Camera(), depth=False, pair=False)
-    scene: Scene | None = None
+def export_coco(folder: Path, count: int, images: TrainingSet, *, jobs: int = 1) -> Iterator[int]:
+    """Write a data set; yield how many of its images are there, again and again.
+
+    Images that are there already are kept, so that a data set can be finished, or made larger.
+
+    Args:
+        folder: gets `images/`, `labels/` and, at the end, `annotations.json`; it must be there.
+        count: how many images.
+        images: what they show.
+        jobs: how many processes.
+
+    Raises:
+        UsageError: an option is out of range, or the folder holds another data set.
+        RecordingError: something cannot be written.
+    """
+    require_jobs(jobs)
+    _require_possible(count, images)
+    with alone_in(folder):
+        for name in ("images", "labels"):
+            _make_folder(folder / name)
+        missing = _missing(folder, count, images)
+        scenes = sorted({index // FRAMES_PER_SCENE for index in missing})
+        done = count - len(missing)
+        yield done
+        with workers(jobs) as pool:
+            make = partial(_make_scene, folder=folder, images=images, wanted=frozenset(missing))
+            for made in pool.map(make, scenes):
+                done += made
+                yield done
+        _put_together(folder, count, images)
+
+
+def _require_possible(count: int, images: TrainingSet) -> None:
+    if count < 1:
+        raise UsageError(f"{count} images; give 1 or more")
+    if images.seed < 0:
+        raise UsageError(f"seed is {images.seed}; give 0 or more")
+    for name in images.species:
+        species_named(name)
+    scaled(Camera(), images.picture_scale)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise RecordingError(
+            f"{folder}: cannot be made ({error.strerror}); check the disk"
+        ) from error
+
+
+def _missing(folder: Path, count: int, images: TrainingSet) -> list[int]:
+    """Return which images are still to be made; a label is written after its image."""
+    missing = []
     for index in range(count):
-        if scene is None or index % FRAMES_PER_SCENE == 0:
-            scene = _any_scene(np.random.default_rng([seed, index, 8]))
-        pose = _any_pose(np.random.default_rng([seed, index, 9]))
-        yield _frame(shoot(scene, pose, lens, index=index, stamp_ns=0, seed=seed))
+        path = _label_path(folder, index)
+        if not (path.exists() and _image_path(folder, index).exists()):
+            missing.append(index)
+        elif _read_label(path)["set"] != images.fields():
+            raise UsageError(
+                f"{path}: belongs to a data set with other options; choose another folder"
+            )
+    return missing
 
 
-def export_coco(
-    directory: Path, count: int, *, seed: int, camera: Camera | None = None
-) -> dict[str, object]:
-    """Write `images/*.jpg` and `annotations.json` under a directory; return the annotations."""
-    (directory / "images").mkdir(parents=True, exist_ok=True)
-    images: list[dict[str, object]] = []
-    annotations: list[dict[str, object]] = []
-    for index, frame in enumerate(training_frames(count, seed=seed, camera=camera)):
-        name = f"images/{index:06d}.jpg"
-        height, width = frame.color_rgb.shape[:2]
-        data = cv2.imencode(
-            ".jpg", frame.color_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        )[1]
-        (directory / name).write_bytes(bytes(data))
-        images.append({"id": index, "file_name": name, "width": width, "height": height})
-        for annotation in _annotations(frame):
-            annotations.append({"id": len(annotations) + 1, "image_id": index, **annotation})
-    document: dict[str, object] = {
-        "info": {"description": "synthetic orchard", "seed": seed},
-        "categories": [{"id": BRANCH, "name": "branch"}],
-        "images": images,
-        "annotations": annotations,
+def _make_scene(number: int, *, folder: Path, images: TrainingSet, wanted: frozenset[int]) -> int:
+    """Write the missing images of a scene and their labels, in a worker; return how many."""
+    camera = scaled(Camera(), images.picture_scale)
+    frames = scene_frames(number, seed=images.seed, species=images.species, camera=camera)
+    made = 0
+    for index, frame in enumerate(frames, start=number * FRAMES_PER_SCENE):
+        if index in wanted:
+            quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+            picture = cv2.imencode(".jpg", frame.color_rgb[..., ::-1], quality)[1]
+            write_whole(_image_path(folder, index), [picture.tobytes()])
+            label = {"set": images.fields(), **label_of(frame, index)}
+            write_whole(_label_path(folder, index), [json.dumps(label).encode()])
+            made += 1
+    return made
+
+
+def label_of(frame: Frame, index: int) -> dict[str, Any]:
+    """Return the COCO entries of an image: `image`, and `annotations` without their own ids."""
+    height, width = frame.color_rgb.shape[:2]
+    image = {
+        "id": index,
+        "file_name": f"images/{_name(index)}.jpg",
+        "width": width,
+        "height": height,
+        "species": frame.species,
+        "topology": frame.topology,
+        "leaf_count": frame.leaf_count,
     }
-    (directory / "annotations.json").write_text(json.dumps(document))
-    return document
+    return {"image": image, "annotations": list(_annotations(frame, index))}
 
 
-def _any_scene(rng: np.random.Generator) -> Scene:
-    species = SPECIES[str(rng.choice(sorted(SPECIES)))]
-    leaves = int(MOST_LEAVES[species.name] * 0.7 * rng.random() ** 2)
-    return build_scene(
-        grow(species, int(rng.integers(1 << 31))),
-        leaves,
-        any_weather(rng),
-        seed=int(rng.integers(1 << 31)),
-        rows=bool(rng.random() < 0.8),
-        trellis=bool(rng.random() < 0.5),
-    )
-
-
-def _any_pose(rng: np.random.Generator) -> FloatArray:
-    """Draw a camera 0.35 to 1.6 m before a point of the crown, upright or turned."""
-    target = np.array([TRUNK_X_M, 0.0, 0.05]) + rng.normal(0, [0.1, 0.25, 0.3])
-    bearing, climb = rng.uniform(-0.7, 0.7), rng.uniform(-0.45, 0.45)
-    ahead = np.array([np.cos(bearing) * np.cos(climb), np.sin(bearing), np.sin(climb)])
-    pose = look_at(target - rng.uniform(0.35, 1.6) * ahead, target)
-    roll = rng.uniform(-np.pi, np.pi) if rng.random() < 0.3 else rng.normal(0, 0.08)
-    c, s = np.cos(roll), np.sin(roll)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return pose @ transform_from(turn, [0.0, 0.0, 0.0])
-
-
-def _frame(shot: Shot) -> Frame:
-    instances, scores = shot.view.instances, shot.view.scores
-    if instances is None or scores is None:
-        raise ValueError("the camera labels every view")
-    return Frame(
-        color_rgb=shot.view.color_rgb,
-        masks=[instances == number for number in range(1, len(scores) + 1)],
-        scores=scores,
-        ignore=(shot.fragments.label >= 0) & (instances == 0),
-    )
-
-
-def _annotations(frame: Frame) -> Iterator[dict[str, object]]:
+def _annotations(frame: Frame, index: int) -> Iterator[dict[str, Any]]:
     for mask, score in zip(frame.masks, frame.scores, strict=True):
-        polygons = _polygons(mask)
-        if polygons:
-            shape = {"segmentation": polygons, "iscrowd": 0, "score": score}
-            yield {"category_id": BRANCH, **shape, **_extent(mask)}
+        yield {
+            "image_id": index,
+            "category_id": BRANCH,
+            "segmentation": polygons(mask),
+            "area": int(mask.sum()),
+            "bbox": box(mask),
+            "iscrowd": 0,
+            "score": score,
+        }
     if frame.ignore.any():
         counts = {"size": list(frame.ignore.shape), "counts": run_lengths(frame.ignore)}
         yield {
+            "image_id": index,
             "category_id": BRANCH,
             "segmentation": counts,
+            "area": int(frame.ignore.sum()),
+            "bbox": box(frame.ignore),
             "iscrowd": 1,
-            **_extent(frame.ignore),
         }
 
 
-def _extent(mask: BoolArray) -> dict[str, object]:
-    v, u = np.nonzero(mask)
-    left, top = int(u.min()), int(v.min())
-    box = [left, top, int(u.max()) - left + 1, int(v.max()) - top + 1]
-    return {"bbox": box, "area": int(mask.sum())}
+def _put_together(folder: Path, count: int, images: TrainingSet) -> None:
+    """Write `annotations.json` from the label files, one at a time."""
+    labels = [_label_path(folder, index) for index in range(count)]
+    pictures = (_read_label(path)["image"] for path in labels)
+    annotations = (one for path in labels for one in _read_label(path)["annotations"])
+    numbered = ({"id": number, **one} for number, one in enumerate(annotations, start=1))
+    info = {"description": "canopy: synthetic orchard", **images.fields()}
+    head = {"info": info, "categories": [{"id": BRANCH, "name": "branch"}]}
+    document = chain(
+        [json.dumps(head)[:-1], ', "images": [\n'],
+        _lines(pictures),
+        ['], "annotations": [\n'],
+        _lines(numbered),
+        ["]}\n"],
+    )
+    write_whole(folder / ANNOTATIONS, (text.encode() for text in document))
 
 
-def _polygons(mask: BoolArray) -> list[list[float]]:
-    """Return the outlines of a mask as flat lists x, y, x, y, … of at least three corners."""
-    found = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    outlines = [contour.reshape(-1, 2) for contour in found[0]]
-    return [outline.ravel().astype(float).tolist() for outline in outlines if len(outline) >= 3]
+def _lines(entries: Iterable[dict[str, Any]]) -> Iterator[str]:
+    comma = ""
+    for entry in entries:
+        yield f"{comma}{json.dumps(entry)}\n"
+        comma = ","
 
 
-def run_lengths(mask: BoolArray) -> list[int]:
-    """Return COCO's uncompressed run lengths: column by column, starting with zeros."""
-    flat = mask.ravel(order="F")
-    turns = np.flatnonzero(np.diff(flat)) + 1
-    lengths = np.diff(np.concatenate([[0], turns, [flat.size]])).tolist()
-    return [0, *lengths] if flat[0] else lengths
+def _read_label(path: Path) -> dict[str, Any]:
+    try:
+        label: dict[str, Any] = json.loads(path.read_bytes())
+        if not {"set", "image", "annotations"} <= label.keys():
+            raise ValueError
+    except (ValueError, AttributeError) as error:
+        raise UsageError(f"{path}: is no label of an image; choose another folder") from error
+    return label
+
+
+def _name(index: int) -> str:
+    return f"{index:06d}"
+
+
+def _image_path(folder: Path, index: int) -> Path:
+    return folder / "images" / f"{_name(index)}.jpg"
+
+
+def _label_path(folder: Path, index: int) -> Path:
+    return folder / "labels" / f"{_name(index)}.json"

@@ -4,16 +4,16 @@
 """
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from hashlib import file_digest
 from pathlib import Path
 from typing import Any
 
-from canopy_skel.errors import CanopyError, RecordingError, UsageError
+from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.recording import read_recording
 from mock_hw.orchard.camera import Camera, scaled
+from mock_hw.orchard.files import write_whole
 from mock_hw.orchard.simulate import Options, require_known
 
 MANIFEST = "manifest.json"
@@ -38,7 +38,7 @@ class Settings:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Stand:
+class LeafyTree:
     """One tree under one foliage density."""
 
     species: str
@@ -88,44 +88,44 @@ class Recorded:
     segmented: float
 
     @property
-    def stand(self) -> Stand:
+    def tree(self) -> LeafyTree:
         """The tree and its foliage."""
-        return Stand(species=self.species, topology=self.topology, foliage=self.foliage)
+        return LeafyTree(species=self.species, topology=self.topology, foliage=self.foliage)
 
 
-def stands(
+def leafy_trees(
     species: Sequence[str], topologies: Sequence[int], foliage: Sequence[int]
-) -> list[Stand]:
+) -> list[LeafyTree]:
     """Return all trees under all densities: the first tree of every species first."""
     return [
-        Stand(species=name, topology=number, foliage=density)
+        LeafyTree(species=name, topology=number, foliage=density)
         for number in topologies
         for name in species
         for density in foliage
     ]
 
 
-def require_possible(wanted: Iterable[Stand], settings: Settings) -> None:
+def require_possible(wanted: Iterable[LeafyTree], settings: Settings) -> None:
     """Check every option before any work is done.
 
     Raises:
         UsageError: one of them is unknown or out of range.
     """
-    for stand in wanted:
-        require_known(stand.options(settings))
+    for tree in wanted:
+        require_known(tree.options(settings))
 
 
-def metadata_of(stand: Stand, settings: Settings, software: str) -> dict[str, str]:
+def metadata_of(tree: LeafyTree, settings: Settings, software: str) -> dict[str, str]:
     """Return the metadata of a recording: what it is of, and how to make it again."""
     return {
-        "tree_id": f"{stand.species}_{stand.topology:03d}",
+        "tree_id": f"{tree.species}_{tree.topology:03d}",
         "rig": "simulated orchard",
         "software": software,
-        SIMULATION_KEY: json.dumps({**asdict(stand), **asdict(settings)}, sort_keys=True),
+        SIMULATION_KEY: json.dumps({**asdict(tree), **asdict(settings)}, sort_keys=True),
     }
 
 
-def finished(folder: Path, settings: Settings, software: str) -> dict[Stand, Recorded]:
+def finished(folder: Path, settings: Settings, software: str) -> dict[LeafyTree, Recorded]:
     """Return what the manifest of a folder lists; nothing if there is none.
 
     Raises:
@@ -142,7 +142,7 @@ def finished(folder: Path, settings: Settings, software: str) -> dict[Stand, Rec
                 f"{path}: is of {_difference(document[key], wanted)}; choose another folder, or"
                 " move this one away"
             )
-    return {one.stand: one for one in recorded_in(document)}
+    return {one.tree: one for one in recorded_in(document)}
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -154,7 +154,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         document: dict[str, Any] = json.loads(path.read_bytes())
-        if document["schema"] != SCHEMA:
+        if document["schema"] != SCHEMA or not {"software", "settings"} <= document.keys():
             raise ValueError(document["schema"])
         recorded_in(document)
     except OSError as error:
@@ -191,28 +191,17 @@ def write_manifest(
             for one in sorted(recordings, key=lambda one: one.file)
         ],
     }
-    part = folder / f".{MANIFEST}.part"
-    try:
-        with part.open("w") as stream:
-            stream.write(json.dumps(document, indent=1) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(part, folder / MANIFEST)
-    except OSError as error:
-        raise RecordingError(
-            f"{folder / MANIFEST}: cannot be written ({error.strerror}); free space, and run again"
-            " to go on"
-        ) from error
+    write_whole(folder / MANIFEST, [(json.dumps(document, indent=1) + "\n").encode()])
 
 
 def flaw_of(folder: Path, one: Recorded) -> str | None:
     """Say what is wrong with a recording that the manifest lists; None if nothing is."""
     path = folder / one.file
-    if not path.exists():
-        return f"{path}: is missing"
-    if sha256_of(path) != one.sha256:
-        return f"{path}: has other bytes than the manifest says"
-    return None
+    try:
+        same = sha256_of(path) == one.sha256
+    except OSError as error:
+        return f"{path}: cannot be read ({error.strerror})"
+    return None if same else f"{path}: has other bytes than the manifest says"
 
 
 def sha256_of(path: Path) -> str:
@@ -221,13 +210,13 @@ def sha256_of(path: Path) -> str:
         return file_digest(stream, "sha256").hexdigest()
 
 
-def require_ours(path: Path, stand: Stand, settings: Settings, software: str) -> None:
+def require_ours(path: Path, tree: LeafyTree, settings: Settings, software: str) -> None:
     """Check that a recording which is about to be replaced would come out as itself.
 
     Raises:
         UsageError: it was made by something else, or nobody knows.
     """
-    wanted = metadata_of(stand, settings, software)
+    wanted = metadata_of(tree, settings, software)
     try:
         metadata = read_recording(path).metadata
     except CanopyError:

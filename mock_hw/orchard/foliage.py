@@ -5,14 +5,14 @@ enough to be found in one image; see `instances`. Seen "by two pixels" would sat
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from canopy_skel.errors import UsageError
 from canopy_skel.frame import Intrinsics
-from canopy_skel.geometry import BoolArray, FloatArray, invert, transform_points
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray, invert, transform_points
 from mock_hw.orchard import renderer
 from mock_hw.orchard.instances import fragments_of, pieces_of
 from mock_hw.orchard.kernels import raster
@@ -42,7 +42,7 @@ class Canopy:
     """All canopies of one tree at once, seen from some poses.
 
     vertex: per view the (H, W) skeleton vertices of the leafless tree; cover: per view the
-    (H, W) number of the first leaf that hides it.
+    (H, W) number of the first leaf that hides it. known: V_det of the leaf counts asked for so far.
     """
 
     tree: Tree
@@ -50,25 +50,32 @@ class Canopy:
     intrinsics: Intrinsics
     vertex: list[Int32Array]
     cover: list[Int32Array]
+    known: dict[int, float] = field(default_factory=dict)
 
     @cached_property
     def framed(self) -> BoolArray:
         """The (V,) skeleton vertices that lie inside the frame of some view."""
         return framed(self.tree, self.poses, self.intrinsics)
 
+    @cached_property
+    def piece(self) -> IntArray:
+        """The (V,) pieces of straight wood."""
+        return pieces_of(self.tree)
+
     def detected(self, leaf_count: int) -> BoolArray:
         """Return (V,) which skeleton vertices are detectable under so many leaves."""
-        piece = pieces_of(self.tree)
         found = np.zeros(len(self.tree.position), dtype=bool)
         for vertex, cover, pose in zip(self.vertex, self.cover, self.poses, strict=True):
             seen = np.where(cover >= leaf_count, vertex, np.int32(-1))
-            fragments = fragments_of(seen, self.tree, piece, pose, self.intrinsics)
+            fragments = fragments_of(seen, self.tree, self.piece, pose, self.intrinsics)
             found[fragments.vertex[fragments.detectable[fragments.fragment]]] = True
         return found
 
     def v_det(self, leaf_count: int) -> float:
         """Return V_det under so many leaves."""
-        return float(self.detected(leaf_count)[self.framed].mean())
+        if leaf_count not in self.known:
+            self.known[leaf_count] = float(self.detected(leaf_count)[self.framed].mean())
+        return self.known[leaf_count]
 
 
 def framed(tree: Tree, poses: list[FloatArray], intrinsics: Intrinsics) -> BoolArray:

@@ -82,13 +82,17 @@ def fragments_of(
     intrinsics: Intrinsics,
 ) -> Fragments:
     """Split an image of skeleton vertices (H, W; -1 = no wood) into fragments."""
-    seen = vertex >= 0
+    wood = np.flatnonzero(vertex >= 0)
+    vertex_of_wood = vertex.ravel()[wood]
+    piece_image = np.full(vertex.shape, -1, dtype=np.int32)
+    piece_image.ravel()[wood] = piece[vertex_of_wood]
     label = np.empty(vertex.shape, dtype=np.int32)
-    count = components(np.where(seen, piece[vertex], -1).astype(np.int32), label)
-    pairs = np.unique(label[seen].astype(np.int64) * len(piece) + vertex[seen])
+    count = components(piece_image, label)
+    label_of_wood = label.ravel()[wood]
+    pairs = np.unique(label_of_wood.astype(np.int64) * len(piece) + vertex_of_wood)
     fragment, shown = pairs // len(piece), pairs % len(piece)
     step_px = _projected_steps(tree, base_from_camera, intrinsics)
-    pixels = np.bincount(label[seen], minlength=count)
+    pixels = np.bincount(label_of_wood, minlength=count)
     skeleton_m = np.bincount(fragment, minlength=count).astype(np.float64) * SPACING_M
     length_px = np.bincount(fragment, weights=step_px[shown], minlength=count)
     width_px = pixels / np.maximum(length_px, 1e-9)

@@ -4,29 +4,23 @@ Every recording is made in a folder of its own inside the data set, and gets its
 finished; only then does the manifest list it.
 """
 
-import fcntl
-import multiprocessing
 import os
 import shutil
-import signal
 import tempfile
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-
-from canopy_skel.errors import RecordingError, UsageError
+from canopy_skel.errors import RecordingError
 from mock_hw.orchard.dataset import (
+    LeafyTree,
     Recorded,
     Settings,
-    Stand,
     finished,
     flaw_of,
     metadata_of,
@@ -38,9 +32,9 @@ from mock_hw.orchard.dataset import (
 from mock_hw.orchard.foliage import FoliageFit
 from mock_hw.orchard.record import record, segmented_share
 from mock_hw.orchard.simulate import fit_densities, prepare
+from mock_hw.orchard.workers import alone_in, require_jobs, workers
 
 _UNFINISHED = ".unfinished-"
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -51,11 +45,11 @@ class Produced:
     made: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class _Order:
     """What a worker needs to know to make one recording."""
 
-    stand: Stand
+    tree: LeafyTree
     settings: Settings
     software: str
     fit: FoliageFit
@@ -64,7 +58,7 @@ class _Order:
 
 
 def produce(
-    folder: Path, wanted: Sequence[Stand], settings: Settings, *, software: str, jobs: int
+    folder: Path, wanted: Sequence[LeafyTree], settings: Settings, *, software: str, jobs: int
 ) -> Iterator[Produced]:
     """Yield the recordings of a data set as they are finished, what is there already first.
 
@@ -83,149 +77,89 @@ def produce(
         UsageError: an option is out of range, or the folder holds something else.
         RecordingError: a recording or the manifest cannot be written.
     """
-    if jobs < 1:
-        raise UsageError(f"jobs is {jobs}; give 1 or more")
+    require_jobs(jobs)
     require_possible(wanted, settings)
-    with _alone_in(folder):
+    with alone_in(folder):
         listed = finished(folder, settings, software)
         kept = [
-            listed[stand]
-            for stand in wanted
-            if stand in listed and flaw_of(folder, listed[stand]) is None
+            listed[tree]
+            for tree in wanted
+            if tree in listed and flaw_of(folder, listed[tree]) is None
         ]
-        missing = [stand for stand in wanted if stand not in {one.stand for one in kept}]
-        for stand in missing:
-            if stand not in listed and (folder / stand.file).exists():
-                require_ours(folder / stand.file, stand, settings, software)
+        missing = [tree for tree in wanted if tree not in {one.tree for one in kept}]
+        for tree in missing:
+            if tree not in listed and (folder / tree.file).exists():
+                require_ours(folder / tree.file, tree, settings, software)
         for one in kept:
             yield Produced(recorded=one, made=False)
-        listed = {stand: one for stand, one in listed.items() if stand not in missing}
+        listed = {tree: one for tree, one in listed.items() if tree not in missing}
         write_manifest(folder, listed.values(), settings, software)
         with _unfinished_in(folder) as unfinished:
-
-            def order(stand: Stand, fit: FoliageFit) -> _Order:
-                return _Order(stand, settings, software, fit, folder, unfinished)
-
+            order = partial(
+                _Order, settings=settings, software=software, folder=folder, unfinished=unfinished
+            )
             for one in _made(missing, order, jobs):
-                listed[one.stand] = one
+                listed[one.tree] = one
                 write_manifest(folder, listed.values(), settings, software)
                 yield Produced(recorded=one, made=True)
 
 
 def _made(
-    missing: Sequence[Stand], order: Callable[[Stand, FoliageFit], _Order], jobs: int
+    missing: Sequence[LeafyTree], order: Callable[..., _Order], jobs: int
 ) -> Iterator[Recorded]:
     """Yield recordings as they are finished; one fit serves all densities of a tree."""
     trees = deque(_by_tree(missing))
     ready: deque[_Order] = deque()
-    fitting: dict[Future[tuple[FoliageFit, ...]], list[Stand]] = {}
+    fitting: dict[Future[tuple[FoliageFit, ...]], list[LeafyTree]] = {}
     recording: set[Future[Recorded]] = set()
-    with _workers(jobs) as pool:
+    with workers(jobs) as pool:
         while trees or ready or fitting or recording:
             while len(fitting) + len(recording) < jobs and (ready or trees):
                 if ready:
                     recording.add(pool.submit(_make, ready.popleft()))
                 else:
                     own = trees.popleft()
-                    densities = [stand.foliage for stand in own]
-                    fit = pool.submit(fit_densities, own[0].species, own[0].topology, densities)
-                    fitting[fit] = own
+                    densities = [tree.foliage for tree in own]
+                    job = pool.submit(fit_densities, own[0].species, own[0].topology, densities)
+                    fitting[job] = own
             under_way: list[Future[Any]] = [*fitting, *recording]
             wait(under_way, return_when=FIRST_COMPLETED)
-            for fit in [one for one in fitting if one.done()]:
-                own = fitting.pop(fit)
-                ready.extend(map(order, own, fit.result()))
+            for fitted in [one for one in fitting if one.done()]:
+                pairs = zip(fitting.pop(fitted), fitted.result(), strict=True)
+                ready.extend(order(tree=tree, fit=fit) for tree, fit in pairs)
             for made in [one for one in recording if one.done()]:
                 recording.remove(made)
                 yield made.result()
 
 
-def _by_tree(wanted: Iterable[Stand]) -> list[list[Stand]]:
-    trees: dict[tuple[str, int], list[Stand]] = {}
-    for stand in wanted:
-        trees.setdefault((stand.species, stand.topology), []).append(stand)
+def _by_tree(wanted: Iterable[LeafyTree]) -> list[list[LeafyTree]]:
+    trees: dict[tuple[str, int], list[LeafyTree]] = {}
+    for tree in wanted:
+        trees.setdefault((tree.species, tree.topology), []).append(tree)
     return list(trees.values())
 
 
 def _make(order: _Order) -> Recorded:
     """Make one recording, in a worker."""
-    stand, settings = order.stand, order.settings
-    part = order.unfinished / stand.file
-    simulation = prepare(stand.options(settings), order.fit)
-    truth = record(simulation, part, metadata_of(stand, settings, order.software))
+    tree, settings = order.tree, order.settings
+    part = order.unfinished / tree.file
+    simulation = prepare(tree.options(settings), order.fit)
+    truth = record(simulation, part, metadata_of(tree, settings, order.software))
     recorded = Recorded(
-        file=stand.file,
+        file=tree.file,
         sha256=sha256_of(part),
         bytes=part.stat().st_size,
-        species=stand.species,
-        topology=stand.topology,
-        foliage=stand.foliage,
+        species=tree.species,
+        topology=tree.topology,
+        foliage=tree.foliage,
         views=settings.views,
         leaf_count=order.fit.leaf_count,
         v_det=round(order.fit.v_det, 6),
         v_det_target=order.fit.target,
         segmented=round(segmented_share(truth), 6),
     )
-    os.replace(part, order.folder / stand.file)
+    os.replace(part, order.folder / tree.file)
     return recorded
-
-
-@contextmanager
-def _workers(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Start processes that compute on one thread each and do not outlive this one."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    spawn = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_work) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-    except BrokenProcessPool as error:
-        raise RecordingError(
-            "a process that simulates was killed, perhaps for want of memory; run again to go on,"
-            " with fewer --jobs"
-        ) from error
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _begin_work() -> None:
-    """Prepare a worker: one thread; gone at once when interrupted, or when its parent is."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    cv2.setNumThreads(1)
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        raise RuntimeError("a worker has a parent")
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, name="follow-parent", daemon=True).start()
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder, so that two runs do not make the same recordings."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(
-                f"{folder}: another canopy simulate writes there; wait for it, or choose another"
-                " folder"
-            ) from error
-        yield
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager

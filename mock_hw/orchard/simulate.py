@@ -1,5 +1,6 @@
 """A simulated scan: tree, foliage, light, camera, noise; views one by one, and the truth."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
@@ -125,7 +126,7 @@ def require_known(options: Options) -> None:
     """
     for name in ("topology", "seed", "leaf_count", "wind_m"):
         value = getattr(options, name)
-        if value is not None and value < 0:
+        if value is not None and not 0 <= value < math.inf:
             raise UsageError(f"{name} is {value}; give 0 or more")
     if options.foliage not in DENSITIES:
         raise UsageError(f"no foliage density {options.foliage}; choose 1, 2, 3 or 4")

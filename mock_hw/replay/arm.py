@@ -91,6 +91,11 @@ class ReplayArm:
         """Return where the flange is now."""
         return self.state().pose
 
+    def check(self) -> None:
+        """Raise NotConnectedError outside the `with` block; nothing else holds this arm."""
+        with self._lock:
+            self._ensure_connected()
+
     def start_move(self, move: Move) -> None:
         """Begin a move to the pose of a view; see `Arm.start_move`.
 

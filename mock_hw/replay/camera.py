@@ -48,10 +48,14 @@ class ReplayCamera:
         """Show nothing any more."""
         self._open = False
 
-    def grab(self, timeout_s: float) -> CameraImage:
-        """Return the picture of where the arm stands, waiting until it stands at one."""
+    def check(self) -> None:
+        """Raise NoCameraError outside the `with` block."""
         if not self._open:
             raise NoCameraError("the camera is not open: use it inside its `with` block")
+
+    def grab(self, timeout_s: float) -> CameraImage:
+        """Return the picture of where the arm stands, waiting until it stands at one."""
+        self.check()
         called_ns = time.monotonic_ns()
         until_s = time.perf_counter() + timeout_s
         while True:

@@ -5,6 +5,7 @@ import sys
 import typer
 
 from canopy_skel.errors import CanopyError, UsageError
+from service.cli.coco import coco
 from service.cli.doctor import doctor
 from service.cli.export import export
 from service.cli.fit_confidence import fit_confidence
@@ -33,6 +34,7 @@ for verb in (
     serve,
     scan,
     simulate,
+    coco,
     doctor,
     fit_confidence,
 ):

@@ -45,13 +45,13 @@ def simulate(
     Run again after an interruption, it goes on where it stopped.
     """
     # Imported here: only this command simulates, and what draws takes long to load.
-    from mock_hw.orchard.dataset import Settings, stands
+    from mock_hw.orchard.dataset import Settings, leafy_trees
     from mock_hw.orchard.production import produce
 
     if check:
         _check(output, as_json=as_json)
         return
-    wanted = stands(
+    wanted = leafy_trees(
         _names(species),
         _topologies(topologies),
         _numbers("--foliage", foliage),
@@ -122,9 +122,11 @@ def _names(text: str) -> list[str]:
 
 def _topologies(text: str) -> list[int]:
     """Return 0…N-1 for a single number N, else the numbers of a list of ranges."""
-    if text.isdecimal():
-        return _numbers("--topologies", f"0-{int(text) - 1}" if int(text) else "-")
-    return _numbers("--topologies", text)
+    if not text.isdecimal():
+        return _numbers("--topologies", text)
+    if int(text) < 1:
+        raise UsageError(f"--topologies {text}: give 1 or more trees")
+    return _numbers("--topologies", f"0-{int(text) - 1}")
 
 
 def _numbers(option: str, text: str) -> list[int]:

@@ -72,10 +72,12 @@ class ArmContract:
 
     def test_outside_its_block_it_says_so(self, make_arm):
         arm = make_arm()
-        with pytest.raises(NotConnectedError):
-            arm.state()
+        for asked in (arm.state, arm.check):
+            with pytest.raises(NotConnectedError):
+                asked()
         with arm:
             arm.state()
+            arm.check()
         arm.__exit__(None, None, None)
         with pytest.raises(NotConnectedError):
             arm.start_move(joint([0.0] * 6))

@@ -31,12 +31,15 @@ class CameraContract:
 
     def test_outside_its_block_it_says_so(self, make_camera):
         camera = make_camera()
-        with pytest.raises(NoCameraError, match="with"):
-            camera.grab(1.0)
-        with camera:
-            camera.grab(GRAB_TIMEOUT_S)
-        with pytest.raises(NoCameraError, match="with"):
-            camera.grab(1.0)
+        for asked in (lambda: camera.grab(1.0), camera.check):
+            with pytest.raises(NoCameraError, match="with"):
+                asked()
+            with camera:
+                camera.check()
+                camera.grab(GRAB_TIMEOUT_S)
+                camera.check()
+            with pytest.raises(NoCameraError, match="with"):
+                asked()
 
     def test_it_can_be_entered_again(self, make_camera):
         camera = make_camera()

@@ -11,23 +11,24 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+from scenes.wood import view_from
 
-from canopy_skel.frame import Intrinsics, StereoPair
 from drivers.oak.messages import Beat, Farewell, Picture, Ready
 from drivers.protocols import CameraImage
 
-SIZE = (400, 640)
-LENS = Intrinsics(fx_px=400.0, fy_px=400.0, cx_px=319.5, cy_px=199.5, width_px=640, height_px=400)
+VIEW = view_from(0)
+GRAIN = np.random.default_rng(0).integers(0, 255, (*VIEW.depth_m.shape, 3), np.uint8)
 
 
 def image():
-    grey = np.full(SIZE, 90, np.uint8)
+    """Three sticks of wood, sharp enough for the quality gate."""
     return CameraImage(
         stamp_ns=time.monotonic_ns(),
-        color_rgb=np.full((*SIZE, 3), 90, np.uint8),
-        intrinsics=LENS,
-        depth_m=np.full(SIZE, 1.25, np.float32),
-        stereo=StereoPair(left_mono=grey, right_mono=grey, intrinsics=LENS, baseline_m=0.075),
+        color_rgb=GRAIN.copy(),
+        intrinsics=VIEW.intrinsics,
+        depth_m=VIEW.depth_m.copy(),
+        instances=VIEW.instances.copy(),
+        scores=VIEW.scores,
     )
 
 

@@ -164,6 +164,37 @@ def test_a_child_killed_between_two_grabs_is_not_noticed_by_the_second(make_came
         camera.grab(5.0)
 
 
+def test_a_camera_that_goes_and_comes_while_nobody_grabs_is_noticed(behaviour, make_camera):
+    with make_camera() as camera:
+        camera.check()
+        behaviour.write_text("absent")
+        os.kill(camera.pid, signal.SIGKILL)
+        wait_for(lambda: refusal(camera) == "the camera's process died (exit code -9)")
+        wait_for(lambda: refusal(camera) == "no OAK camera found: check cable")
+        behaviour.write_text("well")
+        wait_for(lambda: refusal(camera) is None)
+        camera.grab(5.0)
+
+
+def refusal(camera):
+    """Why the camera cannot be used, found out without waiting."""
+    asked = time.perf_counter()
+    try:
+        camera.check()
+    except NoCameraError as error:
+        return str(error)
+    finally:
+        assert time.perf_counter() - asked < 0.5
+    return None
+
+
+def wait_for(condition, timeout_s=10.0):
+    until = time.perf_counter() + timeout_s
+    while not condition():
+        assert time.perf_counter() < until
+        time.sleep(0.02)
+
+
 def test_a_stopped_child_is_replaced(make_camera):
     with make_camera() as camera:
         camera.grab(5.0)

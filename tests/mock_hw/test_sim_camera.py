@@ -195,5 +195,5 @@ def test_a_smaller_picture_shows_the_same(flange, exact):
 
 @pytest.mark.parametrize("scale", [0.0, -1.0])
 def test_a_picture_without_pixels_is_refused(flange, simulation, scale):
-    with pytest.raises(UsageError, match="no pixels"):
+    with pytest.raises(UsageError, match="no pictures scaled by"):
         SimCamera(flange.pose, simulation, scale=scale)

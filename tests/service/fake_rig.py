@@ -35,6 +35,7 @@ class FakeRig:
         self.specs: list[ScanSpec] = []
         self.stops = 0
         self.acknowledged: list[str] = []
+        self.holds: list[str] = []
         self._scans: dict[str, ScanStatus] = {}
         self._skeletons: dict[str, bytes] = {}
         self._listeners: list[Callable[[RigEvent], None]] = []
@@ -120,6 +121,9 @@ class FakeRig:
 
     def stop(self) -> None:
         self.stops += 1
+
+    def hold(self, reason: str) -> None:
+        self.holds.append(reason)
 
     def acknowledge(self, reason: str) -> None:
         if isinstance(self.refusal, RigNotReadyError):

@@ -49,6 +49,9 @@ class StillCamera:
     def __exit__(self, *reasons):
         pass
 
+    def check(self):
+        pass
+
     def grab(self, timeout_s):
         self.grabs += 1
         if self.hangs:
@@ -110,7 +113,9 @@ def camera():
 
 @pytest.fixture
 def rig(fake, camera, tmp_path):
-    arm = GuardedArm(Ur5Arm(Ur5Config(host=fake.host, script_timeout_s=0.5)), LIMITS)
+    # The watchdog is too slow to stop anything in place of the scan.
+    config = Ur5Config(host=fake.host, script_timeout_s=0.5, watchdog_hz=0.2)
+    arm = GuardedArm(Ur5Arm(config), LIMITS)
     parts = RigParts(
         arm=arm,
         camera=camera,
@@ -252,8 +257,26 @@ def test_a_hanging_camera_stops_the_scan_and_it_can_go_on(rig, camera):
     status = wait_for(rig, "scan-1", ScanState.STOPPED)
     assert "CameraTimeoutError: no picture within" in status.detail
     camera.hangs = False
+    with pytest.raises(RigNotReadyError, match=r"no picture within .* acknowledge with a reason"):
+        rig.resume("scan-1")
+    rig.acknowledge("plugged in again")
     rig.resume("scan-1")
     assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+
+
+def test_a_controller_that_was_silent_for_a_moment_does_not_finish_its_move(rig, fake):
+    rig.start(spec(waypoints=WAYPOINTS[-1:], speed_mps=0.005))
+    wait_until_moving(rig, fake)
+    fake.do("freeze")
+    time.sleep(0.4)
+    fake.do("thaw")
+    status = wait_for(rig, "scan-1", ScanState.STOPPED)
+    assert "ControllerFrozenError" in status.detail
+    assert_stands_still(fake)
+    with pytest.raises(RigNotReadyError, match="acknowledge"):
+        rig.resume("scan-1")
+    rig.acknowledge("looked")
+    assert_stands_still(fake)
 
 
 def test_a_bad_picture_is_taken_again(rig, camera):
