@@ -178,13 +178,13 @@ def point_features(seen: Observation, counts: IntArray) -> FloatArray:
     total = np.maximum(empty + counts[:, WOOD] + counts[:, LEAF], 1)
     return np.column_stack(
         [
-            seen.quality,
+            seen.quality[:, :7],
             np.minimum(empty, 3),
             np.log1p(counts[:, WOOD]),
             np.log1p(counts[:, LEAF]),
             np.log1p(counts[:, HIDDEN]),
             counts[:, WOOD] / total,
-            np.log(seen.radius_m),
+            seen.quality[:, 7],
         ]
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from canopy_skel.evidence import ViewEvidence, evidence_of
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray, FloatArray
-from canopy_skel.pieces import Piece, PieceConfig, pieces_of, regions_of_masks
+from canopy_skel.pieces import Piece, PieceConfig, half_width_px, pieces_of, regions_of_masks
 from canopy_skel.segment import BranchMask
 from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import (
@@ -26,8 +26,8 @@ class Observation:
     """What one view shows.
 
     splines: the pieces as polylines. dropped: instances without enough depth. points_in_base,
-    directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 7), score and
-    quality of the piece. evidence: the view, ready to be asked.
+    directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 8), score, quality
+    of the piece, log of half its area over its length. evidence: the view, ready to be asked.
     """
 
     splines: list[BranchSpline]
@@ -76,7 +76,7 @@ def observe(
         directions=directions,
         radius_m=np.array([p.spline.radius_m for p in pieces])[of],
         fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
-        quality=np.array([_quality(p) for p in pieces]).reshape(-1, 7)[of],
+        quality=np.array([_quality(p) for p in pieces]).reshape(-1, 8)[of],
         evidence=evidence_of(view, wood),
     )
 
@@ -91,6 +91,7 @@ def _quality(piece: Piece) -> list[float]:
         valid,
         inlier,
         lateral,
+        float(np.log(piece.spline.radius_m * 0.5 * width_px / half_width_px(piece.quality))),
     ]
 
 

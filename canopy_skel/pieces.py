@@ -106,8 +106,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
     for i in np.flatnonzero(counts).tolist():
         u, v, disparity = knots[i, : counts[i]].T
         points = camera.back_project(u, v, 1.0 / disparity)
-        # Each region is as wide as its area over its length, at its mean depth.
-        radius_m = float(0.5 * quality[i, 2] / camera.fx_px / disparity.mean())
+        radius_m = half_width_px(quality[i]) / camera.fx_px / float(disparity.mean())
         points = points + config.centre_shift * radius_m * away_across(points)
         spline = BranchSpline(
             view_index=view.index,
@@ -118,6 +117,15 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         )
         pieces.append(Piece(spline=spline, fragment=fragments, quality=quality[i]))
     return pieces
+
+
+def half_width_px(quality: FloatArray) -> float:
+    """Return the half width of an even strip of pixels with this deviation from its middle.
+
+    Area over length would be too thin where leaves cut pieces out of the strip.
+    """
+    deviation_px = quality[5] * quality[2]
+    return float(np.sqrt(3.0 * (deviation_px**2 + 1.0 / 12.0)))
 
 
 def depth_of(view: View) -> Float32Array:
