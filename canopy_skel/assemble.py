@@ -53,7 +53,7 @@ def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> 
     graph = _observed_graph(parts, observed)
     graph = with_links(graph, candidates, made, probability[made], parts, config.links.spacing_m)
     graph = with_extensions(
-        graph, rays, lengths(rays, steps, config.extensions.min_probability), steps, parts
+        graph, rays, lengths(rays, parts, steps, config.extensions), steps, parts
     )
     if config.rooted:
         graph = with_tail(graph, config.links.spacing_m)
@@ -78,7 +78,7 @@ def extension_probability(models: Models, rays: Rays) -> FloatArray:
 
 
 def _observed_graph(parts: Parts, observed: Observed) -> SkeletonGraph:
-    source = np.where(observed.support[:, 5] >= 0.5, OBSERVED, FRAGMENT)
+    source = np.where(parts.fragment, FRAGMENT, OBSERVED)
     return SkeletonGraph(
         vertices_in_base=parts.points,
         edges=observed.edges,

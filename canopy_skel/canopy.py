@@ -36,7 +36,8 @@ NO_MAP_NATS = 12.0
 class CanopyConfig:
     """Settings of the stages of mode `canopy`.
 
-    use_fragments: wood outside the masks counts. min_point: points less probable are dropped.
+    use_fragments: wood outside the masks counts. min_point, min_fragment_point: points of
+    instances, of fragments, less probable are dropped.
     min_piece_m: observed parts with less wood, not joined to others, are dropped. rooted: join
     what is left apart as well, with the low confidence it deserves, so that one tree results.
     """
@@ -49,7 +50,8 @@ class CanopyConfig:
     extensions: ExtensionConfig = field(default_factory=ExtensionConfig)
     use_fragments: bool = True
     min_point: float = 0.5
-    min_piece_m: float = 0.01
+    min_fragment_point: float = 0.65
+    min_piece_m: float = 0.03
     rooted: bool = False
 
 
@@ -129,7 +131,8 @@ class CanopyScan:
         probability = np.where(
             fragment, models.fragment_point(features), models.instance_point(features)
         )
-        kept = probability >= self.config.min_point
+        limit = np.where(fragment, self.config.min_fragment_point, self.config.min_point)
+        kept = probability >= limit
         seen = Observations(
             points_in_base=points[kept],
             directions=directions[kept],
@@ -159,6 +162,7 @@ class CanopyScan:
                 length_m=length_m,
                 confidence=models.vertex(vertex_features(observed, length_m)),
                 radius_m=observed.support[:, 1],
+                fragment=observed.support[:, 5] < 0.5,
                 ends=find_ends(observed.vertices_in_base, observed.directions, observed.edges),
             ),
             observed,

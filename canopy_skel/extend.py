@@ -14,12 +14,13 @@ from canopy_skel.links import Cost, Evidence, Parts
 class ExtensionConfig:
     """Steps of `step_m` up to `reach_m`, while the probability is at least `min_probability`.
 
-    An extension also stops within `clear_m` of other wood.
+    From the end of a fragment, whose direction is less sure, `min_fragment_probability`. An extension also stops within `clear_m` of other wood.
     """
 
     step_m: float = 0.005
     reach_m: float = 0.15
     min_probability: float = 0.4
+    min_fragment_probability: float = 0.6
     clear_m: float = 0.012
 
 
@@ -82,9 +83,11 @@ def rays_of(
     )
 
 
-def lengths(rays: Rays, probability: FloatArray, min_probability: float) -> IntArray:
+def lengths(rays: Rays, parts: Parts, probability: FloatArray, config: ExtensionConfig) -> IntArray:
     """Return how many steps each extension goes (K,), for the probabilities (K, n)."""
-    going = rays.open & (probability >= min_probability)
+    fragment = parts.fragment[parts.ends.vertex[rays.end]]
+    limit = np.where(fragment, config.min_fragment_probability, config.min_probability)
+    going = rays.open & (probability >= limit[:, None])
     return np.logical_and.accumulate(going, axis=1).sum(axis=1)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from canopy_skel.ends import Ends
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, is_empty
-from canopy_skel.geometry import FloatArray, IntArray
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels.candidates import link_candidates
 
 Evidence = Callable[[FloatArray], IntArray]
@@ -50,7 +50,7 @@ class Parts:
     """What is to be joined.
 
     points, directions: (V, 3). component: (V,). length_m: (V,), of the component. confidence,
-    radius_m: (V,). ends: the free ends.
+    radius_m, fragment (seen more in fragments than in instances): (V,). ends: the free ends.
     """
 
     points: FloatArray
@@ -59,6 +59,7 @@ class Parts:
     length_m: FloatArray
     confidence: FloatArray
     radius_m: FloatArray
+    fragment: BoolArray
     ends: Ends
 
 
