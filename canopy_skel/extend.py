@@ -14,7 +14,8 @@ from canopy_skel.links import Cost, Evidence, Parts
 class ExtensionConfig:
     """Steps of `step_m` up to `reach_m`, while the probability is at least `min_probability`.
 
-    From the end of a fragment, whose direction is less sure, `min_fragment_probability`. An extension also stops within `clear_m` of other wood.
+    From the end of a fragment, whose direction is less sure, `min_fragment_probability` counts. An
+    extension also stops within `clear_m` of other wood.
     """
 
     step_m: float = 0.005
