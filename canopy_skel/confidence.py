@@ -80,7 +80,12 @@ def models_from(value: Mapping[str, Any]) -> Models:
     return Models(
         provenance=value["provenance"],
         **{
-            name: Logistic(**{k: v if k == "bias" else tuple(v) for k, v in value[name].items()})
+            name: Logistic(
+                bias=value[name]["bias"],
+                weights=tuple(value[name]["weights"]),
+                means=tuple(value[name]["means"]),
+                scales=tuple(value[name]["scales"]),
+            )
             for name in Models.__slots__
             if name != "provenance"
         },
