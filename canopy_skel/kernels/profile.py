@@ -49,7 +49,7 @@ def fit_hats(
         for i, p in ((k - 1, 1.0), (k, -2.0), (k + 1, 1.0)):
             for j, q in ((k - 1, 1.0), (k, -2.0), (k + 1, 1.0)):
                 normal[i, j] += bend * share * p * q
-    return np.linalg.solve(normal, right)
+    return np.linalg.solve(normal, right).astype(np.float64)
 
 
 @njit(cache=True, nogil=True)
