@@ -78,8 +78,8 @@ def evidence_of(view: View, wood: BoolArray) -> ViewEvidence:
     return ViewEvidence(
         intrinsics=view.intrinsics,
         camera_from_base=invert(view.base_from_camera),
-        nearest_m=nearest[every].copy(),
-        farthest_m=farthest[every].copy(),
+        nearest_m=nearest[every].astype(np.float32),
+        farthest_m=farthest[every].astype(np.float32),
         dense=(share > _MIN_VALID)[every].copy(),
         wood=around[every] > 0,
         background=_background(~valid)[every].copy(),

@@ -89,12 +89,12 @@ def lengths(rays: Rays, parts: Parts, probability: FloatArray, config: Extension
     fragment = parts.fragment[parts.ends.vertex[rays.end]]
     limit = np.where(fragment, config.min_fragment_probability, config.min_probability)
     going = rays.open & (probability >= limit[:, None])
-    return np.logical_and.accumulate(going, axis=1).sum(axis=1)
+    return np.asarray(np.logical_and.accumulate(going, axis=1).sum(axis=1), dtype=np.int64)
 
 
 def _beside_wood(parts: Parts, start: IntArray, points: FloatArray, clear_m: float) -> BoolArray:
     """Say which steps (K, n) come within `clear_m` of wood that is not the end itself."""
     distance, _ = cKDTree(parts.points).query(points.reshape(-1, 3))
     from_end = np.linalg.norm(points - parts.points[start][:, None], axis=2)
-    near = distance.reshape(from_end.shape)
+    near = np.asarray(distance).reshape(from_end.shape)
     return np.asarray((near < clear_m) & (near < from_end - 1e-6) & (from_end > clear_m))

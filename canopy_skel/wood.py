@@ -90,7 +90,7 @@ def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray
         return np.zeros(covered.shape, dtype=np.bool_)
     low, high = np.percentile(masked, [2, 98])
     with np.errstate(invalid="ignore"):
-        return (depth_m >= low - config.margin_m) & (depth_m <= high + config.margin_m)
+        return np.asarray((depth_m >= low - config.margin_m) & (depth_m <= high + config.margin_m))
 
 
 def fragments_of(probability: Float32Array, config: FragmentConfig) -> Regions:
