@@ -44,7 +44,7 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python benchmarks/stages.py
+	$(BIN)/python benchmarks/stages.py --output docs/results
 
 bench-scan: $(RUNS)
 	$(BIN)/python benchmarks/waypoints.py

@@ -103,6 +103,15 @@ class CanopyScan:
             seen.points_in_base, [one.evidence for one in self._seen.values()]
         )
 
+    def remove(self, index: int) -> None:
+        """Take a view off again, with all it said of the points of others."""
+        gone = self._seen.pop(index, None)
+        if gone is None:
+            return
+        del self._counts[index]
+        for other, points in self._seen.items():
+            self._counts[other] -= counted(gone.evidence.classify(points.points_in_base))
+
     def evidence(self, points_in_base: FloatArray) -> IntArray:
         """Return how many views say what (N, 6) of points (N, 3)."""
         return count_evidence(points_in_base, [one.evidence for one in self._seen.values()])

@@ -200,6 +200,6 @@ def principal_axes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def flatness(points: FloatArray) -> float:
-    """Return the ratio of the second to the first principal deviation: 0 a line, 1 a blob."""
+    """Return the ratio of second to first principal deviation: 0 a line, 1 a blob or a dot."""
     deviation, _ = principal_axes(points)
-    return float(deviation[1] / max(deviation[0], 1e-12))
+    return float(deviation[1] / deviation[0]) if deviation[0] > 1e-9 else 1.0

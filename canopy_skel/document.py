@@ -62,7 +62,8 @@ class SkeletonDocument:
 
     position: (V, 3); radius, confidence: (V,); occluded: (V,) bool; edges: (E, 2), acyclic,
     partitioned by `branches`, parents before children. root: vertex the main tree grows from,
-    None where there is no vertex. extra: further per-vertex arrays of the JSON by name, e.g.
+    None where there is no vertex. preview: joined by a spanning tree, ahead of the search.
+    extra: further per-vertex arrays of the JSON by name, e.g.
     `segmented` in ground truth.
     """
 
@@ -79,6 +80,7 @@ class SkeletonDocument:
     branches: tuple[Branch, ...]
     root: int | None
     components: int
+    preview: bool = False
     extra: dict[str, tuple[object, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -102,6 +104,7 @@ def build_document(
     method: Method,
     views_used: int,
     views_rejected: Iterable[RejectedView] = (),
+    preview: bool = False,
 ) -> SkeletonDocument:
     """Round a skeleton to 0.01 mm, root it, cut it into branches and number its vertices anew.
 
@@ -129,6 +132,7 @@ def build_document(
         extra={}
         if tree.source is None
         else {"source": tuple(SOURCES[code] for code in tree.source.tolist())},
+        preview=preview,
     )
 
 
@@ -159,6 +163,7 @@ def to_json(document: SkeletonDocument) -> bytes:
         ],
         "root": document.root,
         "components": document.components,
+        **({"preview": True} if document.preview else {}),
     }
     lines = (f"{json.dumps(key)}:{_compact(value)}" for key, value in fields.items())
     return ("{" + ",\n ".join(lines) + "}\n").encode()
@@ -187,6 +192,7 @@ def from_json(data: bytes, source: str = "skeleton document") -> SkeletonDocumen
         branches=tuple(_read_branch(branch) for branch in value["branches"]),
         root=None if value["root"] is None else int(value["root"]),
         components=int(value["components"]),
+        preview=value.get("preview", False),
         extra={name: tuple(column) for name, column in vertices.items()},
     )
 

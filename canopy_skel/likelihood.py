@@ -7,15 +7,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canopy_skel.errors import UsageError
-from canopy_skel.geometry import FloatArray, IntArray
-from canopy_skel.kernels import blocks, ellipsoid
+from canopy_skel.geometry import FloatArray
+from canopy_skel.kernels import ellipsoid
 from canopy_skel.spline import BranchSpline
+from canopy_skel.voxels import Int32Array, VoxelBlocks, grown
 
-Int32Array = NDArray[np.int32]
-BYTES_PER_VOXEL = 128
-"""Sums, rows and what the path search needs per voxel of the map: what the limit counts."""
+BYTES_PER_SLOT = 40
+"""Sums, levels and the path search, with room to grow: what the limit counts per slot."""
+BYTES_PER_VOXEL = 3 * BYTES_PER_SLOT
+"""The same for a voxel that may be new: blocks are about a third full."""
 THICKEST_VOXEL_M = 0.1
 """A larger voxel holds several branches: the map could not tell them apart."""
+
+
+LEVELS = 255
+"""p_l is rounded to 1 / LEVELS where paths are searched."""
+
+
+def _level_table() -> NDArray[np.uint8]:
+    """Return the level, 255 p_l rounded but at least 1, of sums >> LEVEL_SHIFT."""
+    nat = (np.arange(6400) + 0.5) * (1 << ellipsoid.LEVEL_SHIFT) / ellipsoid.UNITS_PER_NAT
+    return np.maximum(np.round(-LEVELS * np.expm1(-nat)), 1).astype(np.uint8)
+
+
+LEVEL_TABLE = _level_table()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -86,41 +101,40 @@ class LikelihoodGrid:
         return np.asarray((self.voxels + 0.5) * self.voxel_size_m, dtype=np.float64)
 
 
-class VoxelIndex:
-    """Finds voxels by their coordinates in a list (N, 3) int32 of distinct ones."""
-
-    def __init__(self, voxels: Int32Array) -> None:
-        block = voxels >> 3
-        low = block.min(axis=0) if len(voxels) else np.zeros(3)
-        high = block.max(axis=0) if len(voxels) else np.zeros(3)
-        self.origin: IntArray = low.astype(np.int64)
-        self.top: Int32Array = np.full((high - low + 1).astype(np.int64), -1, dtype=np.int32)
-        self.slots: Int32Array = blocks.index_voxels(voxels, self.top, self.origin)
-
-    def find(self, voxels: Int32Array) -> Int32Array:
-        """Return the places (M,) of (M, 3) voxels in the list; -1 for those not in it."""
-        return blocks.find_all(self.top, self.origin, self.slots, voxels)
-
-
-def voxels_of(points_in_base: FloatArray, voxel_size_m: float) -> Int32Array:
-    """Return the voxels (N, 3) that (N, 3) points lie in."""
-    return np.floor(points_in_base / voxel_size_m).astype(np.int32)
-
-
 class LikelihoodMap:
-    """The one mutable object of the method: integer sums of -log(1 - p_o) in 8^3 blocks.
+    """The map that grows: integer sums of -log(1 - p_o) in 8^3 blocks.
 
     p_l <- 1 - (1 - p_l)(1 - p_o) (paper eq. 2) is a sum of -log(1 - p_o). Integers make it exact:
-    any order of views gives the same bytes. Memory grows with the wood seen; of the box around it
-    only a table of 4 bytes per block is kept.
+    any order of views gives the same bytes, and a view can be taken off again. Memory grows with
+    the wood seen; of the box around it only a table of 4 bytes per block is kept.
+
+    blocks: numbers the voxels. levels: per slot, 255 p_l rounded, at least 1 where p_l > 0.
     """
 
     def __init__(self, config: LikelihoodConfig, memory_limit_bytes: int = 3 << 30) -> None:
         self._config = config
         self._memory_limit_bytes = memory_limit_bytes
-        self._origin: IntArray = np.zeros(3, dtype=np.int64)
-        self._top: Int32Array = np.full((0, 0, 0), -1, dtype=np.int32)
-        self._sums: Int32Array = np.zeros((0, 512), dtype=np.int32)
+        self.blocks = VoxelBlocks()
+        self.levels: NDArray[np.uint8] = np.zeros(self.blocks.slots, dtype=np.uint8)
+        self._sums: Int32Array = np.zeros(self.blocks.slots, dtype=np.int32)
+        self._marks: NDArray[np.uint8] = np.zeros(self.blocks.slots, dtype=np.uint8)
+        self._changed: list[Int32Array] = []
+
+    @property
+    def voxel_size_m(self) -> float:
+        """Edge length of a voxel."""
+        return self._config.voxel_size_m
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, in bytes."""
+        kept = (self.levels, self._sums, self._marks, self.blocks.top)
+        return sum(array.nbytes for array in kept)
+
+    @property
+    def saturated(self) -> bool:
+        """Whether some sum has hit its limit: then nothing can be taken off exactly."""
+        return bool((self._sums == ellipsoid.MAX_SUM).any())
 
     def add(self, segments: Segments) -> None:
         """Update the map by what one view observed.
@@ -128,70 +142,114 @@ class LikelihoodMap:
         Raises:
             UsageError: the map would not fit into the memory limit at this voxel size.
         """
-        voxel = self._config.voxel_size_m
-        direction = segments.ends_in_base - segments.starts_in_base
-        length = np.linalg.norm(direction, axis=1)
-        kept = length > 1e-9
-        if not kept.any():
-            return
-        lengths, radii = length[kept] / voxel, np.maximum(segments.radius_m[kept] / voxel, 1e-6)
-        starts = segments.starts_in_base[kept] / voxel
-        self._check_memory(starts, lengths, radii)
-        axes = direction[kept] / length[kept, None]
-        k = self._config.k
-        rows = ellipsoid.rows_of_segments(starts, axes, lengths, radii, k)
-        on_segments = [
-            ellipsoid.voxels_on_segment(s, s + n * a)
-            for s, n, a in zip(starts, lengths, axes, strict=True)
-        ]
-        self._allocate(rows, np.concatenate(on_segments))
-        confidences = np.minimum(segments.confidence[kept], self._config.max_confidence)
-        ellipsoid.accumulate(
-            rows, starts, axes, lengths, radii, confidences, k, self._sums, self._top, self._origin
-        )
+        self._accumulate(segments, 1)
 
-    def grid(self) -> LikelihoodGrid:
-        """Return the voxels with p_l > 0 in canonical order."""
-        place = np.argwhere(self._top >= 0)
-        block, offset = np.nonzero(self._sums[self._top[tuple(place.T)]])
-        inside = np.stack([offset >> 6, (offset >> 3) & 7, offset & 7], axis=1)
-        voxels = ((place[block] + self._origin) * 8 + inside).astype(np.int32)
-        units = self._sums[self._top[tuple(place[block].T)], offset]
-        order = np.lexsort(voxels.T[::-1])
-        return LikelihoodGrid(
-            voxel_size_m=self._config.voxel_size_m, voxels=voxels[order], units=units[order]
-        )
+    def remove(self, segments: Segments) -> None:
+        """Take off what was added; the map must not be `saturated`."""
+        self._accumulate(segments, -1)
 
-    @property
-    def voxel_size_m(self) -> float:
-        """The edge of a voxel."""
-        return self._config.voxel_size_m
+    def merge(self, grid: LikelihoodGrid) -> None:
+        """Add what another map of the same voxel size knows."""
+        x, y, z = grid.voxels.T
+        self._cover(np.stack([x, x, y, z, z + 1], axis=1))
+        slots = self.blocks.slots_of(grid.voxels)
+        total = self._sums[slots].astype(np.int64) + grid.units
+        self._sums[slots] = np.minimum(total, ellipsoid.MAX_SUM)
+        places = np.minimum(self._sums[slots] >> ellipsoid.LEVEL_SHIFT, len(LEVEL_TABLE) - 1)
+        self.levels[slots] = LEVEL_TABLE[places]
+        self._changed.append(slots[self._marks[slots] == 0].astype(np.int32))
+        self._marks[slots] = 1
+
+    def take_changed(self) -> Int32Array:
+        """Return the slots whose level may have changed since this was last called."""
+        changed = np.concatenate([np.zeros(0, dtype=np.int32), *self._changed])
+        self._changed = []
+        self._marks[changed] = 0
+        return changed
 
     def occupied(self) -> int:
         """Return the number of voxels with p_l > 0."""
-        return int(np.count_nonzero(self._sums))
+        return int(np.count_nonzero(self.levels))
 
     def probability_at(self, voxels: Int32Array) -> FloatArray:
         """Return p_l (N,) of (N, 3) voxels."""
-        block, inside = (voxels >> 3) - self._origin, voxels & 7
-        units = np.zeros(len(voxels))
-        known = np.flatnonzero(np.all((block >= 0) & (block < self._top.shape), axis=1))
-        slot = self._top[tuple(block[known].T)]
-        known, slot = known[slot >= 0], slot[slot >= 0]
-        x, y, z = inside[known].T
-        units[known] = self._sums[slot, (x << 6) | (y << 3) | z]
+        units = self._sums[self.blocks.slots_of(voxels)]
         return np.asarray(-np.expm1(units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
 
-    def _check_memory(self, starts: FloatArray, lengths: FloatArray, radii: FloatArray) -> None:
+    def empty_probability_at(self, voxels: Int32Array) -> FloatArray:
+        """Return 1 - p_l (N,) of (N, 3) voxels, exact where p_l itself would round to 1."""
+        units = self._sums[self.blocks.slots_of(voxels)]
+        return np.asarray(np.exp(units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
+
+    def grid(self) -> LikelihoodGrid:
+        """Return the voxels with p_l > 0 in canonical order."""
+        slots = np.flatnonzero(self._sums)
+        voxels = self.blocks.voxels_at(slots)
+        order = np.lexsort(voxels.T[::-1])
+        return LikelihoodGrid(
+            voxel_size_m=self.voxel_size_m, voxels=voxels[order], units=self._sums[slots[order]]
+        )
+
+    def _accumulate(self, segments: Segments, sign: int) -> None:
+        rows = self._rows(segments)
+        if len(rows) == 0:
+            return
         k = self._config.k
+        if sign > 0:
+            self._check_memory(rows)
+        wide = ellipsoid.rows_of_segments(rows, k)
+        thin = ellipsoid.rows_on_segments(rows)
+        if sign > 0:
+            self._cover(wide)
+            self._cover(thin)
+        for covered, rest in ((wide, False), (thin, True)):
+            changed = ellipsoid.accumulate(
+                rows,
+                k,
+                covered,
+                rest,
+                sign,
+                self._sums,
+                self.levels,
+                LEVEL_TABLE,
+                self._marks,
+                self.blocks.top,
+                self.blocks.origin,
+            )
+            self._changed.append(changed)
+
+    def _rows(self, segments: Segments) -> FloatArray:
+        """Return the segments that have a length as the kernels take them, (S, 9) in voxels."""
+        voxel = self._config.voxel_size_m
+        direction = segments.ends_in_base - segments.starts_in_base
+        length_m = np.linalg.norm(direction, axis=1)
+        kept = length_m > 1e-9
+        return np.column_stack(
+            [
+                segments.starts_in_base[kept] / voxel,
+                direction[kept] / length_m[kept, None],
+                length_m[kept] / voxel,
+                np.maximum(segments.radius_m[kept] / voxel, 1e-6),
+                np.minimum(segments.confidence[kept], self._config.max_confidence),
+            ]
+        )
+
+    def _cover(self, rows: Int32Array) -> None:
+        self.blocks.cover(rows[:, 1:])
+        self.levels = grown(self.levels, self.blocks.slots, 0)
+        self._sums = grown(self._sums, self.blocks.slots, 0)
+        self._marks = grown(self._marks, self.blocks.slots, 0)
+
+    def _check_memory(self, rows: FloatArray) -> None:
+        k, starts, lengths, radii = self._config.k, rows[:, :3], rows[:, 6], rows[:, 7]
         support = np.pi * (k * radii + 1) ** 2 * ((2 * k + 1) * lengths + 2)
         reach = (k + 1) * lengths.max() + k * radii.max()
         low, high = starts.min(axis=0) - reach, starts.max(axis=0) + reach
-        if self._top.size:
-            low = np.minimum(low, 8.0 * self._origin)
-            high = np.maximum(high, 8.0 * (self._origin + self._top.shape))
+        if self.blocks.top.size:
+            low = np.minimum(low, 8.0 * self.blocks.origin)
+            high = np.maximum(high, 8.0 * (self.blocks.origin + self.blocks.top.shape))
         table = 4.0 * float(np.prod((high - low) / 8.0 + 2.0))
-        needed = (self._sums.size + float(support.sum())) * BYTES_PER_VOXEL + table
+        needed = self.blocks.slots * BYTES_PER_SLOT + float(support.sum()) * BYTES_PER_VOXEL + table
         if needed > self._memory_limit_bytes:
             # Further views will add to the map: advise with room for four times as much.
             fits = self._config.voxel_size_m * (4 * needed / self._memory_limit_bytes) ** (1 / 3)
@@ -200,28 +258,3 @@ class LikelihoodMap:
                 f" {needed / 2**30:.1f} GiB of {self._memory_limit_bytes / 2**30:.1f} GiB;"
                 f" {np.ceil(fits * 1e4) / 1e4:g} m fits"
             )
-
-    def _allocate(self, rows: Int32Array, voxels: Int32Array) -> None:
-        thin = np.concatenate([np.zeros((len(voxels), 1), np.int32), voxels, voxels[:, 2:] + 1], 1)
-        rows = np.concatenate([rows, thin.astype(np.int32)])
-        low = rows[:, [1, 2, 3]].min(axis=0) >> 3
-        high = (rows[:, [1, 2, 4]] - [0, 0, 1]).max(axis=0) >> 3
-        self._cover(low.astype(np.int64), high.astype(np.int64) + 1)
-        ellipsoid.mark_blocks(rows, self._top, self._origin)
-        fresh = np.argwhere(self._top == -2)
-        self._top[tuple(fresh.T)] = len(self._sums) + np.arange(len(fresh))
-        self._sums = np.concatenate([self._sums, np.zeros((len(fresh), 512), np.int32)])
-
-    def _cover(self, low: IntArray, high: IntArray) -> None:
-        """Grow the top table so that it spans blocks [low, high)."""
-        if self._top.size:
-            low = np.minimum(low, self._origin)
-            high = np.maximum(high, self._origin + self._top.shape)
-        if (low == self._origin).all() and (high - low == self._top.shape).all():
-            return
-        top = np.full(high - low, -1, dtype=np.int32)
-        if self._top.size:
-            x, y, z = self._origin - low
-            nx, ny, nz = self._top.shape
-            top[x : x + nx, y : y + ny, z : z + nz] = self._top
-        self._origin, self._top = low, top

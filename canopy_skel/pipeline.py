@@ -20,15 +20,18 @@ from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
-from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, VoxelIndex, segments_of
-from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
+from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
+from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.poses import PoseCorrection
 from canopy_skel.segment import BranchMask, Segmenter
-from canopy_skel.spline import BranchSpline, SplineConfig, fit_spline
+from canopy_skel.spline import BranchSpline, SplineConfig, fit_splines
+from canopy_skel.strands import StrandMap
 from canopy_skel.wood import wood_of
 
 MethodName = Literal["canopy", "paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
+JOINERS: frozenset[MethodName] = frozenset({"paper", "mst", "ftsem"})
+"""Methods that differ only in how they join the observed skeleton."""
 LONGEST_WAY_M = 5.0
 """Between a camera and the nearest other one of a scan."""
 FARTHEST_M = 1e5
@@ -70,6 +73,7 @@ class MethodConfig:
 class Extraction:
     """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1.
 
+    preview: the joins are those of a spanning tree instead.
     corrections: of views whose poses were off (method `canopy`).
     """
 
@@ -77,7 +81,18 @@ class Extraction:
     voxels: int
     observed_components: int
     joins: tuple[Join, ...]
+    preview: bool = False
     corrections: tuple[PoseCorrection, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Known:
+    """What is kept of a view."""
+
+    camera_in_base: FloatArray
+    splines: list[BranchSpline]
+    instances: int
+    rejected: list[RejectedInstance]
 
 
 class Skeletonizer:
@@ -95,12 +110,18 @@ class Skeletonizer:
         self._segmenter = segmenter
         self._config = config
         self._stage = stage
-        self._map = LikelihoodMap(config.likelihood, memory_limit_bytes)
-        self._splines: dict[int, list[BranchSpline]] = {}
-        self._cameras: dict[int, FloatArray] = {}
-        self._instances = 0
-        self._rejected: list[RejectedInstance] = []
+        self._memory_limit_bytes = memory_limit_bytes
+        self._known: dict[int, _Known] = {}
         self._canopy = CanopyScan(config.canopy)
+        self._start()
+
+    def _start(self) -> None:
+        config = self._config
+        self._map = LikelihoodMap(config.likelihood, self._memory_limit_bytes)
+        self._strands = StrandMap(config.likelihood.voxel_size_m, config.initial.smoothing)
+        self._search = PathSearch(self._map)
+        self._initial: SkeletonGraph | None = None
+        self._searched: SkeletonGraph | None = None
 
     @property
     def config(self) -> MethodConfig:
@@ -110,17 +131,17 @@ class Skeletonizer:
     @property
     def views(self) -> tuple[int, ...]:
         """The indices of the views that are in, ascending."""
-        return tuple(sorted(self._splines))
+        return tuple(sorted(self._known))
 
     @property
     def instances(self) -> int:
         """How many branch instances the segmenter found in all views."""
-        return self._instances
+        return sum(known.instances for known in self._known.values())
 
     @property
     def rejected(self) -> tuple[RejectedInstance, ...]:
         """Instances, or parts of them, that gave no cluster."""
-        return tuple(self._rejected)
+        return tuple(one for index in self.views for one in self._known[index].rejected)
 
     def add_view(self, view: View) -> int:
         """Update the map by a view and return how many pieces of wood it showed.
@@ -131,8 +152,8 @@ class Skeletonizer:
             ViewError: the view cannot be used; nothing has changed.
             UsageError: the map would not fit into memory; nothing has changed.
         """
-        if view.index in self._splines:
-            return len(self._splines[view.index])
+        if view.index in self._known:
+            return len(self._known[view.index].splines)
         self._check_place(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
@@ -141,37 +162,72 @@ class Skeletonizer:
         with self._stage("cluster"):
             clusters, rejected = cluster_branches(view, masks, self._config.cluster)
         with self._stage("spline"):
-            splines = [fit_spline(cluster, self._config.spline) for cluster in clusters]
+            splines = fit_splines(clusters, self._config.spline)
         with self._stage("likelihood"):
-            self._map.add(segments_of(splines))
-        self._splines[view.index] = splines
-        self._cameras[view.index] = view.base_from_camera[:3, 3]
-        self._instances += len(masks)
-        self._rejected.extend(rejected)
+            self._add(splines)
+        self._known[view.index] = _Known(
+            camera_in_base=view.base_from_camera[:3, 3],
+            splines=splines,
+            instances=len(masks),
+            rejected=rejected,
+        )
         return len(splines)
 
     def _observe(self, view: View, masks: Sequence[BranchMask]) -> int:
         with self._stage("observe"):
             seen = self._canopy.observe(view, masks, wood_of(self._segmenter, view))
         with self._stage("likelihood"):
-            self._map.add(segments_of(seen.splines))
+            self._add(seen.splines)
         with self._stage("evidence"):
             self._canopy.add(view.index, seen)
-        self._splines[view.index] = seen.splines
-        self._cameras[view.index] = view.base_from_camera[:3, 3]
-        self._instances += len(masks)
-        self._rejected.extend(
-            RejectedInstance(
-                view_index=view.index, instance=instance, reason="too few points with trusted depth"
-            )
-            for instance in seen.dropped
+        self._known[view.index] = _Known(
+            camera_in_base=view.base_from_camera[:3, 3],
+            splines=seen.splines,
+            instances=len(masks),
+            rejected=[
+                RejectedInstance(
+                    view_index=view.index,
+                    instance=instance,
+                    reason="too few points with trusted depth",
+                )
+                for instance in seen.dropped
+            ],
         )
         return len(seen.splines)
+
+    def remove_view(self, index: int) -> None:
+        """Take a view off again, as if it had never been in.
+
+        Raises:
+            UsageError: it is not in.
+        """
+        if index not in self._known:
+            raise UsageError(f"view {index} is not in, so it cannot be removed")
+        gone = self._known.pop(index)
+        self._canopy.remove(index)
+        if self._map.saturated:
+            # What a sum has lost at its limit cannot be told: begin again.
+            self._start()
+            for known in self._known.values():
+                self._add(known.splines)
+            return
+        segments = segments_of(gone.splines)
+        self._map.remove(segments)
+        if self._config.name != "canopy":
+            self._strands.remove(segments)
+        self._initial = None
+
+    def _add(self, splines: list[BranchSpline]) -> None:
+        segments = segments_of(splines)
+        self._map.add(segments)
+        if self._config.name != "canopy":
+            self._strands.add(segments)
+        self._initial = None
 
     def _check_place(self, view: View) -> None:
         """Refuse a view from far away: its pose is wrong, and the map would span the way there."""
         here = view.base_from_camera[:3, 3]
-        away_m = [float(np.linalg.norm(here - there)) for there in self._cameras.values()]
+        away_m = [float(np.linalg.norm(here - k.camera_in_base)) for k in self._known.values()]
         if max(np.abs(here)) > FARTHEST_M or (away_m and min(away_m) > LONGEST_WAY_M):
             raise ViewError(
                 f"view {view.index}: its camera is at ({here[0]:.1f}, {here[1]:.1f}, {here[2]:.1f})"
@@ -179,31 +235,80 @@ class Skeletonizer:
                 " must be in metres"
             )
 
-    def skeleton(self) -> Extraction:
-        """Return the skeleton of all views so far; it does not depend on their order."""
-        if self._config.name == "canopy":
+    def skeleton(self, joined_by: MethodName | None = None) -> Extraction:
+        """Return the skeleton of all views so far; it does not depend on their order.
+
+        Args:
+            joined_by: another method to make the joins by, all before them being the same.
+
+        Raises:
+            UsageError: that method differs from this one in more than the joins.
+        """
+        name = joined_by or self._config.name
+        if name != self._config.name and not {name, self._config.name} <= JOINERS:
+            raise UsageError(
+                f"{name} and {self._config.name} differ before the joins: give each its own"
+                " Skeletonizer"
+            )
+        if name == "canopy":
             with self._stage("canopy"):
                 return self._canopy_skeleton()
-        splines = [spline for index in self.views for spline in self._splines[index]]
-        with self._stage("initial"):
-            grid = self._map.grid()
-            index = VoxelIndex(grid.voxels)
-            initial = initial_skeleton(segments_of(splines), grid, index, self._config.initial)
+        initial = self._observed()
         joins: list[Join] = []
+        search = self._repaired(initial) if name == "paper" else None
         with self._stage("join"):
-            if self._config.name == "mst":
-                graph = join_by_spanning_tree(initial, grid.voxel_size_m)
-            elif self._config.name == "ftsem":
-                graph = join_break_points(initial, grid.voxel_size_m, self._config.ftsem)
+            if search is not None:
+                joins = search.joins()
+                graph = self._joined(initial, joins)
+            elif name == "mst":
+                graph = join_by_spanning_tree(initial, self._map.voxel_size_m)
             else:
-                joins = search_paths(initial, grid, index)
-                graph = add_paths(initial, joins, grid, index)
-                graph = straighten_predicted(graph, self._config.straighten_steps)
+                graph = join_break_points(initial, self._map.voxel_size_m, self._config.ftsem)
+        return self._extraction(initial, graph, joins, preview=False)
+
+    def preview(self) -> Extraction:
+        """Return a skeleton that is quicker to make and joins nearly the same.
+
+        The baselines have none: theirs is the skeleton itself.
+        """
+        if self._config.name != "paper":
+            return self.skeleton()
+        initial = self._observed()
+        search = self._repaired(initial)
+        with self._stage("preview"):
+            joins = search.preview()
+            graph = self._joined(initial, joins)
+        return self._extraction(initial, graph, joins, preview=True)
+
+    def _observed(self) -> SkeletonGraph:
+        """Return G_init."""
+        if self._initial is None:
+            with self._stage("initial"):
+                strands = self._strands.smoothed()
+                self._initial = initial_skeleton(strands, self._map, self._config.initial)
+        return self._initial
+
+    def _repaired(self, initial: SkeletonGraph) -> PathSearch:
+        """Return the search, repaired where views have changed G_init or the map."""
+        if self._searched is not initial:
+            with self._stage("repair"):
+                self._search.update(initial)
+            self._searched = initial
+        return self._search
+
+    def _joined(self, initial: SkeletonGraph, joins: list[Join]) -> SkeletonGraph:
+        graph = add_paths(initial, joins, self._map)
+        return straighten_predicted(graph, self._config.straighten_steps)
+
+    def _extraction(
+        self, initial: SkeletonGraph, graph: SkeletonGraph, joins: list[Join], *, preview: bool
+    ) -> Extraction:
         return Extraction(
             graph=graph,
-            voxels=len(grid.voxels),
+            voxels=self._map.occupied(),
             observed_components=initial.components()[0],
             joins=tuple(joins),
+            preview=preview,
         )
 
     def _canopy_skeleton(self) -> Extraction:

@@ -1,12 +1,14 @@
 """Degree-one B-spline with four control points through a cluster, and its radius (paper III-C)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from canopy_skel.cluster import BranchCluster, principal_axes
+from canopy_skel.cluster import BranchCluster
 from canopy_skel.geometry import FloatArray
+from canopy_skel.kernels import fit
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,55 +39,50 @@ class BranchSpline:
     control_points_in_base: FloatArray
 
 
-def fit_spline(cluster: BranchCluster, config: SplineConfig) -> BranchSpline:
-    """Fit the paper's spline: least squares, degree one, uniform knots along PC1.
+def fit_splines(clusters: Sequence[BranchCluster], config: SplineConfig) -> list[BranchSpline]:
+    """Fit the paper's spline to each cluster: least squares, degree one, uniform knots along PC1.
 
     Degree one makes the basis hat functions and the normal matrix tridiagonal. A knot span without
     points would make it singular: then fewer control points are used.
     """
-    points = cluster.points_in_base
-    _, axes = principal_axes(points)
-    along = (points - points.mean(axis=0)) @ axes[0]
-    along = (along - along.min()) / max(np.ptp(along), 1e-12)
-    count = config.control_points
-    basis = hat_basis(along, count)
-    while count > 2 and basis.sum(axis=0).min() < config.min_weight:
-        count -= 1
-        basis = hat_basis(along, count)
-    control_points = np.linalg.solve(basis.T @ basis, basis.T @ points)
-    ray = direction_across(points.mean(axis=0) - cluster.camera_in_base, axes[0])
-    sideways = np.cross(ray, axes[0])
-    radius_m = radius_across((points - basis @ control_points) @ sideways) + cluster.margin_m
-    return BranchSpline(
-        view_index=cluster.view_index,
-        instance=cluster.instance,
-        confidence=cluster.confidence,
-        radius_m=half_extent(points, axes[1]) if config.radius == "extent" else radius_m,
-        control_points_in_base=control_points + config.centre_shift * radius_m * ray,
+    if not clusters:
+        return []
+    points = np.concatenate([cluster.points_in_base for cluster in clusters])
+    start = np.append(0, np.cumsum([len(cluster.points_in_base) for cluster in clusters]))
+    controls = np.zeros((len(clusters), config.control_points, 3))
+    axes, means = np.zeros((len(clusters), 3, 3)), np.zeros((len(clusters), 3))
+    counts = np.zeros(len(clusters), dtype=np.int64)
+    fit.fit_splines(
+        points, start, len(controls[0]), config.min_weight, controls, axes, means, counts
     )
+    cameras = np.array([cluster.camera_in_base for cluster in clusters])
+    rays = directions_across(means - cameras, axes[:, 0])
+    widths = np.zeros((len(clusters), 2))
+    fit.half_widths(points, start, controls, axes, counts, rays, widths)
+    across_m = widths[:, 1] + [cluster.margin_m for cluster in clusters]
+    radius_m = widths[:, 0] if config.radius == "extent" else across_m
+    controls += (config.centre_shift * across_m[:, None] * rays)[:, None]
+    return [
+        BranchSpline(
+            view_index=cluster.view_index,
+            instance=cluster.instance,
+            confidence=cluster.confidence,
+            radius_m=float(radius_m[i]),
+            control_points_in_base=controls[i, : counts[i]],
+        )
+        for i, cluster in enumerate(clusters)
+    ]
 
 
-def hat_basis(along: FloatArray, count: int) -> FloatArray:
-    """Return (N, count): values of `count` uniform degree-one basis functions at (N,) in [0, 1]."""
-    return np.maximum(0.0, 1.0 - np.abs(along[:, None] * (count - 1) - np.arange(count)))
+def directions_across(vectors: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return the unit directions (N, 3) of `vectors` without their parts along the unit `axes`.
 
-
-def direction_across(vector: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the unit direction (3,) of `vector` without its part along the unit `axis`.
-
-    A vector along the axis has none: then any direction across the axis is returned.
+    A vector along its axis has none: then any direction across the axis is returned.
     """
-    across = vector - (vector @ axis) * axis
-    if np.linalg.norm(across) < 1e-6 * np.linalg.norm(vector):
-        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    return np.asarray(across / np.linalg.norm(across))
-
-
-def half_extent(points: FloatArray, axis: FloatArray) -> float:
-    """Return half the distance between the extreme points along an axis (paper III-C: radius)."""
-    return float(np.ptp(points @ axis)) / 2.0
-
-
-def radius_across(offsets_m: FloatArray) -> float:
-    """Return the half width that (N,) sideways offsets, evenly spread over it, stand for."""
-    return float(np.sqrt(3.0) * np.std(offsets_m))
+    across = vectors - (vectors * axes).sum(axis=1)[:, None] * axes
+    norm = np.linalg.norm(across, axis=1)
+    along = norm < 1e-6 * np.linalg.norm(vectors, axis=1)
+    if along.any():
+        least = np.argmin(np.abs(axes[along]), axis=1)
+        across[along] = np.cross(axes[along], np.eye(3)[least])
+    return np.asarray(across / np.linalg.norm(across, axis=1)[:, None])

@@ -42,7 +42,7 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import consolidate, sample_segments, smooth_across
 from canopy_skel.kernels.ellipsoid import voxels_on_segment
 from canopy_skel.segmenters.recorded import RecordedSegmenter
-from canopy_skel.spline import fit_spline
+from canopy_skel.spline import fit_splines
 
 ROOT = Path(__file__).parents[1]
 MAX_BYTES = 250_000
@@ -105,7 +105,7 @@ def draw_spline(one: Instance, axes: np.ndarray) -> None:
     """Draw the cluster across the ray (radius) and along it (shift to the centre line)."""
     points, controls = one.cluster.points_in_base, one.spline.control_points_in_base
     unshifted = replace(CONFIG.spline, centre_shift=0.0)
-    on_surface = fit_spline(one.cluster, unshifted).control_points_in_base
+    on_surface = fit_splines([one.cluster], unshifted)[0].control_points_in_base
     shift = (controls - on_surface)[0]
     ray = shift / np.linalg.norm(shift)
     axis = principal_axes(points)[1][0]

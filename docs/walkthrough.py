@@ -19,14 +19,15 @@ from canopy_skel.document import RejectedView, from_json
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
-from canopy_skel.initial import initial_skeleton, sample_segments
-from canopy_skel.likelihood import LikelihoodGrid, LikelihoodMap, Segments, VoxelIndex, segments_of
-from canopy_skel.pathsearch import Join, add_paths, search_paths, straighten_predicted
+from canopy_skel.initial import initial_skeleton
+from canopy_skel.likelihood import LikelihoodGrid, LikelihoodMap, Segments, segments_of
+from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
-from canopy_skel.spline import BranchSpline, fit_spline
+from canopy_skel.spline import BranchSpline, fit_splines
+from canopy_skel.strands import StrandMap, sample_segments
 from drivers.stereo import with_depth
 
 CONFIG = MethodConfig()
@@ -77,22 +78,25 @@ def walk_through(path: Path) -> Walk:
     recording = read_recording(path)
     views = [with_depth(v) for v in recording.views() if not isinstance(v, RejectedView)]
     likelihood = LikelihoodMap(CONFIG.likelihood)
+    strands = StrandMap(CONFIG.likelihood.voxel_size_m, CONFIG.initial.smoothing)
     splines: list[BranchSpline] = []
     instances: list[Instance] = []
     for view in views:
         for mask in RecordedSegmenter().segment(view):
             clusters, _ = cluster_branches(view, [mask], CONFIG.cluster)
-            fitted = [fit_spline(cluster, CONFIG.spline) for cluster in clusters]
+            fitted = fit_splines(clusters, CONFIG.spline)
             splines += fitted
             likelihood.add(segments_of(fitted))
+            strands.add(segments_of(fitted))
             if len(clusters) == 1:
                 one = Instance(view=view, mask=mask, cluster=clusters[0], spline=fitted[0])
                 instances.append(one)
     segments, grid = segments_of(splines), likelihood.grid()
-    index = VoxelIndex(grid.voxels)
-    initial = initial_skeleton(segments, grid, index, CONFIG.initial)
-    joins = search_paths(initial, grid, index)
-    paper = straighten_predicted(add_paths(initial, joins, grid, index), CONFIG.straighten_steps)
+    initial = initial_skeleton(strands.smoothed(), likelihood, CONFIG.initial)
+    search = PathSearch(likelihood)
+    search.update(initial)
+    joins = search.joins()
+    paper = straighten_predicted(add_paths(initial, joins, likelihood), CONFIG.straighten_steps)
     voxel_m = grid.voxel_size_m
     results = {
         "paper": paper,
@@ -163,7 +167,7 @@ def telling_instance(walk: Walk) -> Instance:
 
 def path_points(walk: Walk, join: Join) -> FloatArray:
     """Return the voxel centres (n, 3) of a path of Algorithm 1."""
-    return walk.grid.centres_in_base()[join.nodes]
+    return np.asarray((join.voxels + 0.5) * walk.grid.voxel_size_m)
 
 
 def gap_m(walk: Walk, join: Join) -> float:
@@ -179,7 +183,7 @@ def telling_join(walk: Walk) -> Join:
         ends = path_points(walk, join)[[0, -1]]
         seen = np.linalg.norm(walk.flat(ends)[1] - walk.flat(ends)[0])
         fits = 0.08 <= gap_m(walk, join) <= 0.25 and seen >= 0.85 * gap_m(walk, join)
-        return fits, -abs(float(np.log10(join.cost_nat / len(join.nodes) + 1e-4)) + 1.0)
+        return fits, -abs(float(np.log10(join.cost_nat / len(join.voxels) + 1e-4)) + 1.0)
 
     return max(walk.joins, key=worth)
 
@@ -201,7 +205,7 @@ def busiest_fork(walk: Walk) -> FloatArray:
     """Return the fork of the initial skeleton around which most segments were seen."""
     degree = np.bincount(walk.initial.edges.ravel(), minlength=len(walk.initial.vertices_in_base))
     forks = walk.initial.vertices_in_base[degree >= 3]
-    samples = sample_segments(walk.segments, 0.5 * walk.grid.voxel_size_m).points_in_base
+    samples = sample_segments(walk.segments, 0.5 * walk.grid.voxel_size_m)[0]
     near = [(np.linalg.norm(samples - fork, axis=1) < 0.08).sum() for fork in forks]
     return np.asarray(forks[int(np.argmax(near))])
 

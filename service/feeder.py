@@ -191,7 +191,7 @@ class ViewFeeder:
     def _behind(self, workers: Sequence[WorkerSeen]) -> str | None:
         """Return a scan of whose skeleton an idle worker has a newer version."""
         for beat in (one.heartbeat for one in workers):
-            order = (beat.revision, len(beat.rejected))
+            order = (beat.revision, len(beat.rejected), True)
             if (
                 not beat.busy
                 and beat.revision

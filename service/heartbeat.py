@@ -11,19 +11,20 @@ PERIOD_S = 0.5
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Version:
-    """How much a document knows: views in it, views rejected; later ones are greater."""
+    """How much a document knows: views in it, views rejected, not just a preview."""
 
     revision: int = 0
     rejected: int = 0
+    exact: bool = True
 
     def encode(self) -> bytes:
         """Return the bytes that go with a document on the bus."""
         return encode_json(asdict(self))
 
     @property
-    def order(self) -> tuple[int, int]:
+    def order(self) -> tuple[int, int, bool]:
         """What to sort by."""
-        return (self.revision, self.rejected)
+        return (self.revision, self.rejected, self.exact)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,6 +74,10 @@ def decode_version(data: bytes) -> Version:
     """
     try:
         fields = json.loads(data)
-        return Version(revision=int(fields["revision"]), rejected=int(fields["rejected"]))
+        return Version(
+            revision=int(fields["revision"]),
+            rejected=int(fields["rejected"]),
+            exact=bool(fields.get("exact", True)),
+        )
     except (ValueError, TypeError, KeyError) as error:
         raise BusError(f"skeleton: its attachment cannot be read ({error})") from error

@@ -75,13 +75,17 @@ class LiveSkeleton:
         """Remember a view as unusable."""
         self._rejected[index] = RejectedView(index=index, reason=reason)
 
-    def document(self) -> bytes | None:
-        """Return the skeleton document (JSON) of the views so far; None without a usable view."""
+    def document(self, *, preview: bool = False) -> bytes | None:
+        """Return the skeleton document (JSON) of the views so far; None without a usable view.
+
+        A preview says so in the document, takes less time and joins nearly the same.
+        """
         if not self.views:
             return None
+        maker = self._skeletonizer
         document = document_of(
-            self._skeletonizer,
-            self._skeletonizer.skeleton(),
+            maker,
+            maker.preview() if preview else maker.skeleton(),
             scan_id=self._scan_id,
             rejected=self._rejected.values(),
         )
@@ -107,5 +111,6 @@ def warm_up(stage: Stage) -> None:
     )
     skeletonizer = Skeletonizer(SEGMENTERS["recorded"](), MethodConfig(), stage=stage)
     skeletonizer.add_view(view)
+    skeletonizer.preview()
     extraction = skeletonizer.skeleton()
     to_json(document_of(skeletonizer, extraction, scan_id="warm-up", rejected=()))

@@ -182,7 +182,7 @@ def _summary(
             "observed_components": extraction.observed_components,
             "components": document.components,
             "paths": [
-                {"cost_nat": round(join.cost_nat, 4), "voxels": len(join.nodes)}
+                {"cost_nat": round(join.cost_nat, 4), "voxels": len(join.voxels)}
                 for join in extraction.joins
             ],
         },

@@ -33,4 +33,5 @@ def document_of(
         ),
         views_used=used,
         views_rejected=sorted(rejected, key=lambda view: view.index),
+        preview=extraction.preview,
     )

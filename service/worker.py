@@ -165,13 +165,13 @@ class Worker:
     def _publish(self) -> None:
         """Publish the skeleton of every scan that has grown since its last one.
 
-        While views are waiting, at most half of the time goes into skeletons.
+        While views are waiting, at most half of the time goes into skeletons, and previews do.
         """
-        start_s = time.monotonic()
+        start_s, exact = time.monotonic(), self._inbox.empty()
         for scan_id, scan in self._scans.items():
-            version = Version(revision=len(scan.views), rejected=len(scan.rejected))
+            version = Version(revision=len(scan.views), rejected=len(scan.rejected), exact=exact)
             known, _ = self._documents.get(scan_id, (Version(), b""))
-            data = scan.document() if version != known else None
+            data = scan.document(preview=not exact) if version.order > known.order else None
             if data is None:
                 continue
             with self._lock:

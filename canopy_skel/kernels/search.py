@@ -1,204 +1,329 @@
-"""Algorithm 1 of the paper, exact, by one multi-source search that is repaired after each join.
+"""Shortest paths from many sources at once over the 26-neighbours of a voxel grid.
 
-A distance is one int64: cost in units of 2^-24 nat above LENGTH_BITS bits of path length (5, 7 or 9
-per step, near enough to 1 : sqrt 2 : sqrt 3), good for 2^18 nat and 580 m at 5 mm. The fine unit
-keeps a saturated map (p near 1) from being a plateau: paths still follow its ridges. Ties are
-broken by length, then by the lower predecessor, so nothing wanders.
+The paper's edge cost -log((p_u + p_v) / 2) is taken from levels (p in 1/255) in 1/4096 nat, plus 5,
+7 or 9 for the length of the step (near enough to 1 : sqrt 2 : sqrt 3): without it p = 1 would make
+plateaus in which a path wanders. Costs are integers, so repairs are exact. Of equally good ways a
+voxel takes the one through the lowest direction, which is the lowest voxel: what comes out is a
+function of levels and sources alone. No step costs less than WIDTH, so all entries of a bucket of
+this width are final once it is their turn.
 """
 
-import heapq
 import math
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import find
+from canopy_skel.kernels.blocks import CENTRE, beside
 
-Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
-UNITS_PER_NAT = 1 << 24
-LENGTH_BITS = 20
-STEP_LENGTH = (0, 5, 7, 9)
-UNREACHED = 1 << 62
+UNITS_PER_NAT = 4096
+UNREACHED = (1 << 31) - 1
+WIDTH = 5
+WINDOW = 8192
+"""Buckets of a round; the dearest step spans fewer than WINDOW of them."""
+MASK = 2 * WINDOW - 1
 
 
-@njit(cache=True, nogil=True)
-def edge_weight(q_u: float, q_v: float, step: int) -> int:
-    """Return -log((p_u + p_v) / 2) (paper eq. 4) with its length, from q = 1 - p."""
-    cost: int = round(-math.log1p(-0.5 * (q_u + q_v)) * UNITS_PER_NAT)
-    return (cost << LENGTH_BITS) + STEP_LENGTH[step]
+def _costs() -> Int32s:
+    """Return the cost of a step by the sum of its two levels (0 to 510)."""
+    total = [0.0, *(-math.log(both / 510) * UNITS_PER_NAT for both in range(1, 511))]
+    return np.round(total).astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
-def root_of(parent: Int32s, label: int) -> int:
-    """Return the representative of a component, shortening the way to it."""
-    while parent[label] != label:
-        parent[label] = parent[parent[label]]
-        label = parent[label]
-    return label
+def _lengths() -> Int32s:
+    """Return what the length of a step adds, by direction."""
+    steps = np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0).ravel()
+    lengths: Int32s = np.array([0, 5, 7, 9], dtype=np.int32)[steps]
+    return lengths
 
 
-@njit(cache=True, nogil=True)
-def neighbours_of(voxels: Int32s, top: Int32s, origin: Ints, slots: Int32s, node: int) -> Ints:
-    """Return (n, 2): the 26-neighbours of a node and how many coordinates differ (1, 2 or 3)."""
-    found = np.zeros((26, 2), dtype=np.int64)
-    count = 0
-    x, y, z = voxels[node]
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                step = abs(dx) + abs(dy) + abs(dz)
-                if step == 0:
-                    continue
-                other = find(top, origin, slots, x + dx, y + dy, z + dz)
-                if other >= 0:
-                    found[count] = (other, step)
-                    count += 1
-    return found[:count]
+COSTS = _costs()
+LENGTHS = _lengths()
 
 
-@njit(cache=True, nogil=True)
-def settle(
-    heap: list[tuple[int, int]],
-    voxels: Int32s,
-    q: Floats,
-    top: Int32s,
-    origin: Ints,
-    slots: Int32s,
-    distance: Ints,
-    previous: Int32s,
-    label: Int32s,
-) -> Ints:
-    """Relax from the (distance, node) heap until it is empty; return the nodes that changed.
+@njit("int32[::1](int32[::1], int64)", cache=True, nogil=True)
+def resized(entries: Int32s, length: int) -> Int32s:
+    """Return a copy with room for `length` entries, or of the first ones."""
+    copy = np.empty(length, dtype=np.int32)
+    for i in range(min(len(entries), length)):
+        copy[i] = entries[i]
+    return copy
 
-    A node follows the neighbour with the least (distance through it, number); a node whose
-    predecessor got another label takes it over, so that labels stay those of the forest.
+
+@njit(
+    "boolean(int64, uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1])",
+    cache=True,
+    nogil=True,
+)
+def pull(
+    v: int, levels: Bytes, neighbours: Int32s, distance: Int32s, previous: Bytes, label: Int32s
+) -> bool:
+    """Give v the best way through its neighbours if it is better than its own; say if it is."""
+    best, through, found = int(distance[v]), int(previous[v]), 0
+    if distance[v] == UNREACHED:
+        through = 27
+    for k in range(27):
+        u = beside(neighbours, v, k)
+        if k == CENTRE or levels[u] == 0 or distance[u] == UNREACHED:
+            continue
+        cost = int(distance[u]) + COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k]
+        if cost < best or (cost == best and k < through):
+            best, through, found = cost, k, u
+    if found == 0:
+        return False
+    distance[v], previous[v], label[v] = best, through, label[found]
+    return True
+
+
+@njit(
+    "int32[::1](int32[::1], int32[:,::1], int32[::1], uint8[::1], uint8[::1])",
+    cache=True,
+    nogil=True,
+)
+def invalidate(
+    seeds: Int32s, neighbours: Int32s, distance: Int32s, previous: Bytes, touched: Bytes
+) -> Int32s:
+    """Make unreached all whose way leads through the seeds; return them, seeds first.
+
+    A seed itself is made unreached unless it is a source (previous = CENTRE). Blocks whose borders
+    may change are noted in `touched`.
     """
-    changed = [0]
-    changed.clear()
-    while heap:
-        reached, u = heapq.heappop(heap)
-        if reached != distance[u]:
+    stack = resized(seeds, max(1024, len(seeds)))
+    count = len(seeds)
+    for i in range(count):
+        if previous[stack[i]] != CENTRE:
+            distance[stack[i]] = UNREACHED
+    done = 0
+    while done < count:
+        u = int(stack[done])
+        done += 1
+        touched[u >> 9] = 1
+        for k in range(27):
+            v = beside(neighbours, u, k)
+            if k < CENTRE:
+                touched[v >> 9] = 1
+            if previous[v] == 26 - k and k != CENTRE and distance[v] != UNREACHED:
+                distance[v] = UNREACHED
+                if count == len(stack):
+                    stack = resized(stack, 2 * count)
+                stack[count] = v
+                count += 1
+    return resized(stack, count)
+
+
+@njit(
+    "int64(int32[::1], int32[::1], uint8[::1], int32[::1], int32[:,::1], int64[::1])",
+    cache=True,
+    nogil=True,
+)
+def fill_ring(
+    waiting: Int32s, distance: Int32s, queued: Bytes, heads: Int32s, pool: Int32s, state: Ints
+) -> int:
+    """Put the nearest waiting slots into the buckets; return how many go on waiting.
+
+    state: entries in the pool, entries in the buckets, first bucket, bucket the round ends at.
+    """
+    nearest = int(UNREACHED)
+    for i in range(len(waiting)):
+        if queued[waiting[i]]:
+            nearest = min(nearest, distance[waiting[i]] // WIDTH)
+    state[0], state[1], state[2], state[3] = 0, 0, nearest, nearest + WINDOW
+    kept = 0
+    for i in range(len(waiting)):
+        slot = waiting[i]
+        bucket = distance[slot] // WIDTH
+        if not queued[slot]:
             continue
-        changed.append(u)
-        for v, step in neighbours_of(voxels, top, origin, slots, u):
-            through = reached + edge_weight(q[u], q[v], step)
-            if through > distance[v]:
-                continue
-            if through == distance[v]:
-                relabel = previous[v] == u and label[v] != label[u]
-                if not (u < previous[v] or relabel):
-                    continue
-            distance[v] = through
-            previous[v] = u
-            label[v] = label[u]
-            heapq.heappush(heap, (through, v))
-    return np.unique(np.array(changed))
+        if bucket >= state[3]:
+            waiting[kept] = slot
+            kept += 1
+        else:
+            pool[state[0], 0], pool[state[0], 1] = slot, heads[bucket & MASK]
+            heads[bucket & MASK] = state[0]
+            state[0] += 1
+    state[1] = state[0]
+    return kept
 
 
-@njit(cache=True, nogil=True)
-def borders(
-    nodes: Ints,
-    voxels: Int32s,
-    q: Floats,
-    top: Int32s,
-    origin: Ints,
-    slots: Int32s,
-    distance: Ints,
+@njit("int32[::1](int32[::1], int64, int32[::1], int32[:,::1], int64)", cache=True, nogil=True)
+def empty_ring(waiting: Int32s, kept: int, heads: Int32s, pool: Int32s, count: int) -> Int32s:
+    """Return the slots that wait, those still in the buckets among them."""
+    waiting = resized(waiting, kept + count)
+    for bucket in range(len(heads)):
+        entry = heads[bucket]
+        heads[bucket] = -1
+        while entry >= 0:
+            waiting[kept] = pool[entry, 0]
+            kept += 1
+            entry = pool[entry, 1]
+    return waiting
+
+
+@njit("int32[:,::1](int32[:,::1], int64)", cache=True, nogil=True)
+def larger(pool: Int32s, length: int) -> Int32s:
+    """Return a copy of a pool (N, 2) with room for `length` entries."""
+    copy = np.empty((length, 2), dtype=np.int32)
+    for i in range(min(len(pool), length)):
+        copy[i, 0], copy[i, 1] = pool[i, 0], pool[i, 1]
+    return copy
+
+
+@njit(
+    "void(int64, uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1], uint8[::1],"
+    " uint8[::1], int32[::1], int32[:,::1], int64[::1])",
+    cache=True,
+    nogil=True,
+)
+def relax(
+    u: int,
+    levels: Bytes,
+    neighbours: Int32s,
+    distance: Int32s,
+    previous: Bytes,
     label: Int32s,
-    parent: Int32s,
-) -> list[tuple[int, int, int]]:
-    """Return (path length, u, v), u < v, of all edges from these nodes between two components."""
-    edges = [(0, 0, 0)]
-    edges.clear()
-    for u in nodes:
-        if distance[u] == UNREACHED:
+    queued: Bytes,
+    touched: Bytes,
+    heads: Int32s,
+    pool: Int32s,
+    state: Ints,
+) -> None:
+    """Offer all neighbours of u the way through u."""
+    reached, level, own = int(distance[u]), int(levels[u]), label[u]
+    touched[u >> 9] = 1
+    for k in range(27):
+        v = beside(neighbours, u, k)
+        if k < CENTRE:
+            touched[v >> 9] = 1
+        if levels[v] == 0 or k == CENTRE:
             continue
-        for v, step in neighbours_of(voxels, top, origin, slots, u):
-            if distance[v] == UNREACHED:
+        through = reached + COSTS[level + int(levels[v])] + LENGTHS[k]
+        known = int(distance[v])
+        if through > known or through >= UNREACHED:
+            continue
+        if through == known:
+            if 26 - k > previous[v]:
                 continue
-            if root_of(parent, label[u]) != root_of(parent, label[v]):
-                total = distance[u] + edge_weight(q[u], q[v], step) + distance[v]
-                edges.append((total, min(u, v), max(u, v)))
-    return edges
+            previous[v] = 26 - k
+            if label[v] == own:
+                continue
+        distance[v], previous[v], label[v] = through, 26 - k, own
+        bucket = through // WIDTH
+        if queued[v] and known // WIDTH == bucket:
+            continue
+        queued[v] = 1
+        pool[state[0], 0], pool[state[0], 1] = v, heads[bucket & MASK]
+        heads[bucket & MASK] = state[0]
+        state[0] += 1
+        state[1] += 1
 
 
-@njit(cache=True, nogil=True)
-def trace(previous: Int32s, u: int, v: int) -> Ints:
-    """Return the path over edge (u, v), from the source behind u to the source behind v."""
-    path = [u]
-    while previous[path[-1]] != path[-1]:
-        path.append(int(previous[path[-1]]))
-    path.reverse()
-    path.append(v)
-    while previous[path[-1]] != path[-1]:
-        path.append(int(previous[path[-1]]))
-    return np.array(path)
+@njit(
+    "int64(int32[::1], uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1], uint8[::1],"
+    " uint8[::1])",
+    cache=True,
+    nogil=True,
+)
+def settle(
+    waiting: Int32s,
+    levels: Bytes,
+    neighbours: Int32s,
+    distance: Int32s,
+    previous: Bytes,
+    label: Int32s,
+    queued: Bytes,
+    touched: Bytes,
+) -> int:
+    """Relax from the waiting slots (all `queued`) until nothing changes; return how many settled.
+
+    Buckets are lists of (slot, next) in a pool, in a ring. What is too far off for the ring waits
+    for a later round. A slot may have several entries; only the first finds it queued.
+    """
+    heads = np.empty(MASK + 1, dtype=np.int32)
+    for i in range(len(heads)):
+        heads[i] = -1
+    pool = np.empty((max(1 << 16, 2 * len(waiting)), 2), dtype=np.int32)
+    state = np.zeros(4, dtype=np.int64)
+    settled = 0
+    while len(waiting) > 0:
+        kept = fill_ring(waiting, distance, queued, heads, pool, state)
+        current = state[2]
+        while state[1] > 0 and (current < state[3] or kept == 0):
+            entry = heads[current & MASK]
+            if entry < 0:
+                current += 1
+                continue
+            heads[current & MASK] = pool[entry, 1]
+            state[1] -= 1
+            u = int(pool[entry, 0])
+            if queued[u]:
+                queued[u] = 0
+                settled += 1
+                if state[0] + 27 > len(pool):
+                    pool = larger(pool, 2 * len(pool))
+                relax(
+                    u, levels, neighbours, distance, previous, label, queued, touched, heads,
+                    pool, state,
+                )  # fmt: skip
+        waiting = empty_ring(waiting, kept, heads, pool, state[1])
+        if len(waiting) > len(pool):
+            pool = larger(pool, 2 * len(waiting))
+    return settled
 
 
-@njit(cache=True, nogil=True)
-def join_components(
-    voxels: Int32s,
-    q: Floats,
-    top: Int32s,
-    origin: Ints,
-    slots: Int32s,
+@njit(
+    "int64(int32[::1], int32[::1], int32[::1], int32[::1], int32[::1], uint8[::1], int32[:,::1],"
+    " int32[::1], uint8[::1], int32[::1], uint8[::1], uint8[::1])",
+    cache=True,
+    nogil=True,
+)
+def repair(
+    raised: Int32s,
+    lowered: Int32s,
+    gone: Int32s,
     sources: Int32s,
     source_label: Int32s,
-    label_count: int,
-) -> tuple[Ints, Ints, Ints]:
-    """Join components by the cheapest path between any two of them, again and again (Algorithm 1).
+    levels: Bytes,
+    neighbours: Int32s,
+    distance: Int32s,
+    previous: Bytes,
+    label: Int32s,
+    queued: Bytes,
+    touched: Bytes,
+) -> int:
+    """Make the forest of shortest ways right again; return how many slots were settled.
 
-    `voxels` (N, 3) are the nodes in lexicographic order and `q` (N,) their 1 - p; `top`, `origin`
-    and `slots` index them. `sources` (S,) are the nodes that contain skeleton, `source_label` (S,)
-    the component of each.
-
-    Returns the nodes of all paths, one after the other, each from source to source; the first
-    index of each path; the cost of each path in 2^-24 nat.
+    `raised` and `lowered` are the slots whose level has changed, `gone` those that are no longer
+    sources, `sources` those that are new or have another label. Ways that got dearer are cut off
+    and found anew; all else can only have become better.
     """
-    distance = np.full(len(voxels), UNREACHED)
-    previous = np.full(len(voxels), -1, dtype=np.int32)
-    label = np.full(len(voxels), -1, dtype=np.int32)
-    parent = np.arange(label_count).astype(np.int32)
-    heap = [(0, 0)]
-    heap.clear()
+    seeds = np.empty(len(gone) + len(lowered), dtype=np.int32)
+    for i in range(len(gone)):
+        previous[gone[i]] = 27  # no way at all
+        seeds[i] = gone[i]
+    for i in range(len(lowered)):
+        seeds[len(gone) + i] = lowered[i]
+    cut = invalidate(seeds, neighbours, distance, previous, touched)
+    waiting = np.empty(len(cut) + len(raised) + len(sources), dtype=np.int32)
+    count = 0
     for i in range(len(sources)):
-        s = sources[i]
-        distance[s], previous[s], label[s] = 0, s, source_label[i]
-        heap.append((0, int(s)))
-    settle(heap, voxels, q, top, origin, slots, distance, previous, label)
-    everywhere = np.arange(len(voxels))
-    edges = borders(everywhere, voxels, q, top, origin, slots, distance, label, parent)
-    heapq.heapify(edges)
-    path_nodes = [0]
-    path_nodes.clear()
-    path_starts = [0]
-    path_starts.clear()
-    costs = [0]
-    costs.clear()
-    while edges:
-        total, u, v = heapq.heappop(edges)
-        if root_of(parent, label[u]) == root_of(parent, label[v]):
+        s = int(sources[i])
+        distance[s], previous[s], label[s] = 0, CENTRE, source_label[i]
+        queued[s] = 1
+        waiting[count] = s
+        count += 1
+    for i in range(len(cut) + len(raised)):
+        v = int(cut[i] if i < len(cut) else raised[i - len(cut)])
+        if levels[v] == 0:
             continue
-        step = np.abs(voxels[u] - voxels[v]).sum()
-        if total != distance[u] + edge_weight(q[u], q[v], step) + distance[v]:
-            continue
-        path = trace(previous, u, v)
-        kept, gone = root_of(parent, label[u]), root_of(parent, label[v])
-        parent[max(kept, gone)] = min(kept, gone)
-        path_starts.append(len(path_nodes))
-        costs.append(total >> LENGTH_BITS)
-        for node in path:
-            path_nodes.append(node)
-            if distance[node] > 0:
-                distance[node], previous[node] = 0, node
-                label[node] = min(kept, gone)
-                heap.append((0, node))
-        heapq.heapify(heap)
-        changed = settle(heap, voxels, q, top, origin, slots, distance, previous, label)
-        for edge in borders(changed, voxels, q, top, origin, slots, distance, label, parent):
-            heapq.heappush(edges, edge)
-    return np.array(path_nodes), np.array(path_starts), np.array(costs)
+        better = pull(v, levels, neighbours, distance, previous, label)
+        if (better or (i >= len(cut) and distance[v] != UNREACHED)) and queued[v] == 0:
+            queued[v] = 1
+            waiting[count] = v
+            count += 1
+    return settle(
+        resized(waiting, count), levels, neighbours, distance, previous, label, queued, touched
+    )

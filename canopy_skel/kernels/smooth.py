@@ -13,27 +13,16 @@ Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
 
-@njit(cache=True, nogil=True)
-def cells_around(top: Int32s, origin: Ints, slots: Int32s, x: int, y: int, z: int) -> Ints:
-    """Return the occupied cells among the 27 around (x, y, z)."""
-    found = np.zeros(27, dtype=np.int64)
-    count = 0
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                cell = find(top, origin, slots, x + dx, y + dy, z + dz)
-                if cell >= 0:
-                    found[count] = cell
-                    count += 1
-    return found[:count]
-
-
-@njit(cache=True, nogil=True)
+@njit(
+    "Tuple((float64[:,::1], float64[:,::1]))(float64[:,::1], float64[:,::1], float64[:,::1],"
+    " int64[::1], int32[:,:,::1], int64[::1], int32[:,::1], float64, float64, float64)",
+    cache=True,
+    nogil=True,
+)
 def mean_shift_across(
     points: Floats,
     directions: Floats,
     references: Floats,
-    reference_directions: Floats,
     cell_start: Ints,
     top: Int32s,
     origin: Ints,
@@ -44,27 +33,32 @@ def mean_shift_across(
 ) -> tuple[Floats, Floats]:
     """Move points (P, 3) to the weighted mean of the references, across their direction only.
 
-    References (R, 3) lie sorted by cells of `cell_m`: those of cell i at cell_start[i] up to
-    cell_start[i + 1]. Only those within one cell length and with |cos| of the angle between the
-    directions of at least `min_cosine` count, with Gaussian weights. Returns the moved points and
-    the mean directions (P, 3).
+    References (R, 7), each a position, a unit direction and a weight, lie sorted by cells of
+    `cell_m`: those of cell i at cell_start[i] up to cell_start[i + 1]. Only those within one cell
+    length and with |cos| of the angle between the directions of at least `min_cosine` count, with
+    Gaussian weights times their own. Returns the moved points and the mean directions (P, 3).
     """
-    moved = points.copy()
-    turned = directions.copy()
+    moved, turned = np.empty((len(points), 3)), np.empty((len(points), 3))
+    falloff = -0.5 / (bandwidth_m * bandwidth_m)
     for i in range(len(points)):
-        px, py, pz = points[i]
-        dx, dy, dz = directions[i]
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         total = ox = oy = oz = ex = ey = ez = 0.0
         x, y, z = math.floor(px / cell_m), math.floor(py / cell_m), math.floor(pz / cell_m)
-        for cell in cells_around(top, origin, slots, x, y, z):
+        for k in range(27):
+            cell = find(top, origin, slots, x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1)
+            if cell < 0:
+                continue
             for j in range(cell_start[cell], cell_start[cell + 1]):
-                wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
+                wx = references[j, 0] - px
+                wy = references[j, 1] - py
+                wz = references[j, 2] - pz
                 squared = wx * wx + wy * wy + wz * wz
-                rx, ry, rz = reference_directions[j]
+                rx, ry, rz = references[j, 3], references[j, 4], references[j, 5]
                 cosine = dx * rx + dy * ry + dz * rz
                 if squared > cell_m * cell_m or abs(cosine) < min_cosine:
                     continue
-                weight = math.exp(-0.5 * squared / (bandwidth_m * bandwidth_m))
+                weight = references[j, 6] * math.exp(falloff * squared)
                 signed = weight if cosine > 0.0 else -weight
                 total += weight
                 ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
@@ -74,6 +68,8 @@ def mean_shift_across(
             ex, ey, ez = ex / norm, ey / norm, ez / norm
             ox, oy, oz = ox / total, oy / total, oz / total
             along = ox * ex + oy * ey + oz * ez
-            moved[i] = (px + ox - along * ex, py + oy - along * ey, pz + oz - along * ez)
-            turned[i] = (ex, ey, ez)
+            px, py, pz = px + ox - along * ex, py + oy - along * ey, pz + oz - along * ez
+            dx, dy, dz = ex, ey, ez
+        moved[i, 0], moved[i, 1], moved[i, 2] = px, py, pz
+        turned[i, 0], turned[i, 1], turned[i, 2] = dx, dy, dz
     return moved, turned

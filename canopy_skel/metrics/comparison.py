@@ -127,6 +127,14 @@ class Comparison:
         masked = pieces.flag(segmented)
         return recall(masked), recall(~masked), recall(~masked & ~hidden), recall(hidden)
 
+    def detectable(self) -> float | None:
+        """Return the share of framed truth that some mask covers (V_det)."""
+        segmented = self.true.flags("segmented")
+        if segmented is None:
+            return None
+        pieces = self.true.pieces
+        return share(pieces.flag(segmented), pieces.length_m, among=self.framed)
+
     def length_ratio(self) -> float | None:
         """Return the length of the output over the length of the truth it covers."""
         covered_m = float(self.true.pieces.length_m[self.found].sum())

@@ -36,6 +36,8 @@ class Scores:
     recall_masked, recall_unmasked: of truth that is, or is not, `segmented`.
     recall_visible_unmasked: of truth that is neither `segmented` nor `occluded`.
     recall_hidden: of truth that is `occluded`.
+    v_det: share of the framed truth that is `segmented`: what a perfect front end would find.
+    v_det_ratio: recall_length / v_det, above 1 when more is found than any mask showed.
     occ_precision: share right of the predicted output.
     gaps: gaps of at least 30 mm between masked parts of the truth (`joining.find_gaps`).
     joined: share of these, by number, that the output connects (`joining.joined_gaps`).
@@ -66,6 +68,8 @@ class Scores:
     recall_unmasked: float | None
     recall_visible_unmasked: float | None
     recall_hidden: float | None
+    v_det: float | None
+    v_det_ratio: float | None
     occ_precision: float | None
     gaps: int | None
     joined: float | None
@@ -130,6 +134,8 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
     gaps, joined = _gaps(both, spacing_m)
     radius_error_median, radius_error_mean = both.radius_errors()
     recall_masked, recall_unmasked, recall_visible_unmasked, recall_hidden = both.recalls()
+    recall_length = share(both.found, true.pieces.length_m, among=both.framed)
+    v_det = both.detectable()
     components, acyclic = components_and_acyclic(len(out.positions), out.document.edges)
     all_m = out.pieces.length_m
     predicted_m = all_m * both.predicted
@@ -142,7 +148,7 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
         recall_vertices=recall_vertices,
         osr_vertices=osr_vertices,
         precision_length=share(both.right, all_m),
-        recall_length=share(both.found, true.pieces.length_m, among=both.framed),
+        recall_length=recall_length,
         precision_directional=both.directional_precision(WITHIN_DEGREES),
         precision_strict=precision_strict,
         osr_strict=osr_strict,
@@ -150,6 +156,8 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
         recall_unmasked=recall_unmasked,
         recall_visible_unmasked=recall_visible_unmasked,
         recall_hidden=recall_hidden,
+        v_det=v_det,
+        v_det_ratio=recall_length / v_det if v_det and recall_length is not None else None,
         occ_precision=share(both.right, all_m, among=both.predicted),
         gaps=gaps,
         joined=joined,

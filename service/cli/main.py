@@ -7,6 +7,7 @@ import typer
 from canopy_skel.errors import CanopyError, UsageError
 from service.cli.coco import coco
 from service.cli.doctor import doctor
+from service.cli.experiment import experiment
 from service.cli.export import export
 from service.cli.fit_confidence import fit_confidence
 from service.cli.inspect import inspect
@@ -40,6 +41,7 @@ for verb in (
 ):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)
+app.add_typer(experiment)
 
 
 def main() -> None:

@@ -103,6 +103,12 @@ def test_the_order_of_views_and_asking_in_between_do_not_matter_to_the_byte(view
         assert to_json(document_of(maker)) == expected
 
 
+def test_a_view_taken_off_leaves_no_trace(views):
+    maker = maker_of(views)
+    maker.remove_view(1)
+    assert to_json(document_of(maker)) == to_json(document_of(maker_of([views[0], views[2]])))
+
+
 def test_rooted_gives_one_tree_whose_extra_joins_nobody_will_believe(clear_views):
     apart, rooted = (document_of(maker_of(clear_views, rooted=r)) for r in (False, True))
     assert apart.components > 1

@@ -8,11 +8,10 @@ from canopy_skel.initial import (
     consolidate,
     initial_skeleton,
     prune_spurs,
-    sample_segments,
-    smooth_across,
     spanning_forest,
 )
-from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments, VoxelIndex
+from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments
+from canopy_skel.strands import SmoothingConfig, StrandMap, sample_segments
 
 VOXEL = 0.005
 
@@ -39,11 +38,17 @@ def many_views_of_a_branch(seed=0, views=12, noise_m=0.003):
     return segments_from(starts, ends)
 
 
+def strands_of(*groups):
+    strands = StrandMap(VOXEL, SmoothingConfig())
+    for segments in groups:
+        strands.add(segments)
+    return strands
+
+
 def skeleton_of(segments):
     likelihood = LikelihoodMap(LikelihoodConfig(voxel_size_m=VOXEL))
     likelihood.add(segments)
-    grid = likelihood.grid()
-    return initial_skeleton(segments, grid, VoxelIndex(grid.voxels), InitialConfig())
+    return initial_skeleton(strands_of(segments).smoothed(), likelihood, InitialConfig())
 
 
 def length_of(graph):
@@ -55,10 +60,10 @@ def length_of(graph):
 def test_samples_lie_on_their_segments_no_further_apart_than_asked(seed, spacing_m):
     random = np.random.default_rng(seed)
     starts, ends = random.uniform(-0.1, 0.1, (2, 5, 3))
-    samples = sample_segments(segments_from(starts, ends), spacing_m)
+    points, directions, _ = sample_segments(segments_from(starts, ends), spacing_m)
     for start, end in zip(starts, ends, strict=True):
         axis = (end - start) / np.linalg.norm(end - start)
-        own = samples.points_in_base[(np.abs(samples.directions - axis) < 1e-9).all(axis=1)]
+        own = points[(np.abs(directions - axis) < 1e-9).all(axis=1)]
         along = np.sort((own - start) @ axis)
         assert along[0] < 1e-9
         assert abs(along[-1] - np.linalg.norm(end - start)) < 1e-9
@@ -75,17 +80,47 @@ def test_noisy_views_of_one_branch_become_one_line():
 
 
 def test_smoothing_keeps_the_ends_where_they_are():
-    segments = many_views_of_a_branch()
-    smoothed = smooth_across(sample_segments(segments, VOXEL), InitialConfig())
-    along = smoothed.points_in_base[:, 0]
+    along = strands_of(many_views_of_a_branch()).smoothed().points_in_base[:, 0]
     assert along.min() < 0.002
     assert along.max() > 0.298
 
 
 def test_crossing_branches_are_not_pulled_into_each_other():
     segments = segments_from([(-0.1, 0, 0), (0, -0.1, 0.004)], [(0.1, 0, 0), (0, 0.1, 0.004)])
-    smoothed = smooth_across(sample_segments(segments, VOXEL), InitialConfig())
+    smoothed = strands_of(segments).smoothed()
     assert set(np.round(smoothed.points_in_base[:, 2], 6)) == {0.0, 0.004}
+
+
+def part_of(segments, chosen):
+    names = ("starts_in_base", "ends_in_base", "radius_m", "confidence")
+    return Segments(**{name: getattr(segments, name)[chosen] for name in names})
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_smoothing_what_has_changed_gives_what_smoothing_everything_gives(seed):
+    random = np.random.default_rng(seed)
+    starts = random.uniform(-0.1, 0.1, (12, 3))
+    segments = segments_from(starts, starts + random.normal(0, 0.04, (12, 3)))
+    views = [part_of(segments, slice(i, i + 3)) for i in range(0, 12, 3)]
+    grown = strands_of()
+    for view in views:
+        grown.add(view)
+        grown.smoothed()
+    grown.remove(views[1])
+    grown.smoothed()
+    grown.add(views[1])
+    grown.remove(views[2])
+    one = grown.smoothed()
+    other = strands_of(views[3], views[1], views[0]).smoothed()
+    for name in ("points_in_base", "radius_m", "weight"):
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+
+
+def test_strands_do_not_grow_with_the_number_of_views():
+    few = strands_of(many_views_of_a_branch(views=200)).smoothed()
+    many = strands_of(many_views_of_a_branch(views=1000)).smoothed()
+    assert len(many.weight) < 1.6 * len(few.weight)
+    assert many.weight.sum() > 4.9 * few.weight.sum()
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -133,11 +168,10 @@ def test_a_straight_piece_of_wood_stays_one_piece(seed):
 
 
 def test_one_vertex_per_voxel_inside_it():
-    samples = sample_segments(many_views_of_a_branch(), VOXEL)
-    vertices, radius_m = consolidate(samples, VOXEL)
+    vertices, radius_m = consolidate(strands_of(many_views_of_a_branch()).smoothed(), VOXEL)
     voxels = np.floor(vertices / VOXEL)
     assert len(np.unique(voxels, axis=0)) == len(vertices)
-    np.testing.assert_allclose(radius_m, 0.004)
+    np.testing.assert_allclose(radius_m, 0.004, atol=1e-6)
 
 
 def test_spurs_go_and_twigs_stay():

@@ -4,19 +4,23 @@ from hypothesis import strategies as st
 from oracles import naive_pathsearch
 
 from canopy_skel.graph import SkeletonGraph
-from canopy_skel.likelihood import LikelihoodGrid, VoxelIndex
-from canopy_skel.pathsearch import add_paths, search_paths, straighten_predicted
+from canopy_skel.likelihood import LikelihoodConfig, LikelihoodGrid, LikelihoodMap
+from canopy_skel.pathsearch import PathSearch, add_paths, straighten_predicted
 
 VOXEL = 0.01
 
 
-def grid_from(units):
+def map_from(units):
     voxels = np.array(sorted(units), dtype=np.int32).reshape(-1, 3)
-    return LikelihoodGrid(
-        voxel_size_m=VOXEL,
-        voxels=voxels,
-        units=np.array([units[tuple(v)] for v in voxels.tolist()], dtype=np.int32),
+    likelihood = LikelihoodMap(LikelihoodConfig(voxel_size_m=VOXEL))
+    likelihood.merge(
+        LikelihoodGrid(
+            voxel_size_m=VOXEL,
+            voxels=voxels,
+            units=np.array([units[tuple(v)] for v in voxels.tolist()], dtype=np.int32),
+        )
     )
+    return likelihood
 
 
 def graph_from(components):
@@ -58,83 +62,85 @@ def small_maps(draw):
 
 
 def search(units, components):
-    grid = grid_from(units)
-    index = VoxelIndex(grid.voxels)
+    likelihood = map_from(units)
     graph = graph_from(components)
-    return graph, search_paths(graph, grid, index), grid, index
+    paths = PathSearch(likelihood)
+    paths.update(graph)
+    return graph, paths.joins(), likelihood
 
 
-def q_of(units):
-    return {v: float(np.exp(n / -65536)) for v, n in units.items()}
+def levels_of(units):
+    return {v: naive_pathsearch.level(n) for v, n in units.items()}
 
 
 @given(small_maps())
-@settings(max_examples=300)
+@settings(max_examples=500)
 def test_joins_are_those_of_the_literal_algorithm(case):
     units, components = case
-    _, joins, grid, _ = search(units, components)
-    expected = naive_pathsearch.join_paths(q_of(units), components)
-    found = [[tuple(grid.voxels[n].tolist()) for n in join.nodes] for join in joins]
-    assert found == expected
+    _, joins, _ = search(units, components)
+    expected = naive_pathsearch.join_paths(levels_of(units), components)
+    assert [[tuple(v) for v in join.voxels.tolist()] for join in joins] == expected
 
 
 @given(small_maps())
 @settings(max_examples=60)
 def test_costs_are_those_of_all_pairs_in_every_round(case):
     units, components = case
-    _, joins, _, _ = search(units, components)
-    costs = [cost for cost, _ in naive_pathsearch.join_costs(q_of(units), components)]
-    assert [round(join.cost_nat * naive_pathsearch.UNITS_PER_NAT) for join in joins] == costs
+    _, joins, _ = search(units, components)
+    assert [join.units for join in joins] == naive_pathsearch.join_costs(
+        levels_of(units), components
+    )
 
 
 @given(small_maps())
 @settings(max_examples=100)
 def test_the_joined_skeleton_is_acyclic_and_inside_the_map(case):
     units, components = case
-    graph, joins, grid, index = search(units, components)
-    joined = add_paths(graph, joins, grid, index)
+    graph, joins, likelihood = search(units, components)
+    joined = add_paths(graph, joins, likelihood)
     count, _ = joined.components()
     assert len(joined.edges) == len(joined.vertices_in_base) - count
     assert count == len(components) - len(joins)
-    assert (index.find(np.floor(joined.vertices_in_base / VOXEL).astype(np.int32)) >= 0).all()
+    voxels = np.floor(joined.vertices_in_base / VOXEL).astype(np.int32)
+    assert (likelihood.probability_at(voxels) > 0).all()
     np.testing.assert_array_equal(joined.occluded[: len(graph.occluded)], False)
     assert joined.occluded[len(graph.occluded) :].all()
 
 
 def test_a_saturated_map_does_not_make_paths_wander():
     units = {(x, y, z): 1 << 30 for x in range(40) for y in range(12) for z in range(12)}
-    _, joins, _, _ = search(units, [[(0, 5, 5)], [(39, 5, 5)]])
-    assert len(joins[0].nodes) == 40
+    _, joins, _ = search(units, [[(0, 5, 5)], [(39, 5, 5)]])
+    assert len(joins[0].voxels) == 40
 
 
 def test_a_very_costly_way_is_still_a_way():
     units = {(x, 0, 0): 1 for x in range(1000)}
-    _, joins, _, _ = search(units, [[(0, 0, 0)], [(999, 0, 0)]])
-    assert len(joins[0].nodes) == 1000
+    _, joins, _ = search(units, [[(0, 0, 0)], [(999, 0, 0)]])
+    assert len(joins[0].voxels) == 1000
     assert joins[0].cost_nat > 10_000
 
 
 def test_no_way_no_join():
     units = {(x, 0, 0): 50_000 for x in range(10) if x != 5}
-    _, joins, _, _ = search(units, [[(0, 0, 0)], [(9, 0, 0)]])
+    _, joins, _ = search(units, [[(0, 0, 0)], [(9, 0, 0)]])
     assert joins == []
 
 
 def test_a_piece_outside_the_map_stays_alone():
     units = {(x, 0, 0): 50_000 for x in range(10)}
-    _, joins, _, _ = search(units, [[(0, 0, 0)], [(9, 0, 0)], [(30, 30, 30)]])
+    _, joins, _ = search(units, [[(0, 0, 0)], [(9, 0, 0)], [(30, 30, 30)]])
     assert len(joins) == 1
 
 
 def test_an_empty_map_joins_nothing():
-    _, joins, _, _ = search({}, [[(0, 0, 0)], [(9, 0, 0)]])
+    _, joins, _ = search({}, [[(0, 0, 0)], [(9, 0, 0)]])
     assert joins == []
 
 
 def test_straightening_moves_predicted_vertices_only():
     units = {(x, x % 2, 0): 50_000 for x in range(20)}
-    graph, joins, grid, index = search(units, [[(0, 0, 0)], [(19, 1, 0)]])
-    joined = add_paths(graph, joins, grid, index)
+    graph, joins, likelihood = search(units, [[(0, 0, 0)], [(19, 1, 0)]])
+    joined = add_paths(graph, joins, likelihood)
     straight = straighten_predicted(joined, 30)
     np.testing.assert_array_equal(
         straight.vertices_in_base[~joined.occluded], joined.vertices_in_base[~joined.occluded]

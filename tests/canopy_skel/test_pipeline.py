@@ -8,7 +8,9 @@ from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.likelihood import LikelihoodConfig
 from canopy_skel.pipeline import METHODS, MethodConfig, Skeletonizer
+from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.recorded import RecordedSegmenter
+from drivers.stereo import with_depth
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,84 @@ def test_moving_the_camera_rig_by_whole_voxels_moves_the_skeleton(views):
     np.testing.assert_array_equal(one.edges, other.edges)
 
 
+def test_after_every_view_the_skeleton_is_that_of_a_start_from_scratch(views):
+    maker = skeletonizer()
+    for count, view in enumerate(views, start=1):
+        maker.add_view(view)
+        maker.preview()
+        scratch = skeletonizer()
+        for known in reversed(views[:count]):
+            scratch.add_view(known)
+        assert bytes_of(maker) == bytes_of(scratch)
+
+
+@pytest.mark.parametrize("name", ["oak_fd3", "apple_dense"])
+def test_after_every_view_of_a_recording_too(shared_recording, name):
+    views = [with_depth(view) for view in read_recording(shared_recording(name)).views()]
+    order = np.random.default_rng(len(name)).permutation(len(views))
+    maker, known = skeletonizer(voxel=0.01), []
+    for i in order:
+        maker.add_view(views[i])
+        known.append(views[i])
+        scratch = skeletonizer(voxel=0.01)
+        for view in known:
+            scratch.add_view(view)
+        assert bytes_of(maker) == bytes_of(scratch)
+    for i in order[:-2]:
+        maker.skeleton()
+        maker.remove_view(i)
+    scratch = skeletonizer(voxel=0.01)
+    for i in order[-2:]:
+        scratch.add_view(views[i])
+    assert bytes_of(maker) == bytes_of(scratch)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_view_that_is_removed_was_never_there(views, name):
+    maker, other = skeletonizer(name), skeletonizer(name)
+    for view in views:
+        maker.add_view(view)
+    maker.skeleton()
+    maker.remove_view(1)
+    other.add_view(views[2])
+    other.add_view(views[0])
+    assert maker.views == (0, 2)
+    assert maker.instances == other.instances
+    assert bytes_of(maker) == bytes_of(other)
+    maker.add_view(views[1])
+    other.add_view(views[1])
+    assert bytes_of(maker) == bytes_of(other)
+    for index in (0, 1, 2):
+        maker.remove_view(index)
+    assert maker.skeleton().voxels == 0
+    with pytest.raises(UsageError, match="view 1 is not in"):
+        maker.remove_view(1)
+
+
+def test_views_can_be_removed_where_sums_have_hit_their_limit(views):
+    maker, other = skeletonizer(), skeletonizer()
+    for view in views[:2]:
+        maker.add_view(view)
+    sums = maker._map._sums
+    sums[np.argmax(sums)] = 1 << 30
+    maker.remove_view(0)
+    other.add_view(views[1])
+    assert bytes_of(maker) == bytes_of(other)
+
+
+def test_a_preview_says_so_and_is_a_forest_with_as_many_pieces(views):
+    maker = skeletonizer()
+    for view in views:
+        maker.add_view(view)
+    preview, exact = maker.preview(), maker.skeleton()
+    assert preview.preview
+    assert not exact.preview
+    assert preview.graph.components()[0] == exact.graph.components()[0]
+    count = preview.graph.components()[0]
+    assert len(preview.graph.edges) == len(preview.graph.vertices_in_base) - count
+    assert len(preview.joins) == len(exact.joins)
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_gives_a_forest(views, name):
     # Method canopy sees the sky through an open gap, and leaves it open.
@@ -146,3 +226,17 @@ def test_the_configuration_hash_names_the_settings():
     assert MethodConfig().sha256() == MethodConfig().sha256()
     other = MethodConfig(likelihood=LikelihoodConfig(voxel_size_m=0.01))
     assert MethodConfig().sha256() != other.sha256()
+
+
+def test_methods_that_share_their_front_end_are_as_each_alone(views):
+    shared = skeletonizer()
+    for view in views:
+        shared.add_view(view)
+    for name in METHODS:
+        alone = skeletonizer(name)
+        for view in views:
+            alone.add_view(view)
+        graph, other = alone.skeleton().graph, shared.skeleton(joined_by=name).graph
+        np.testing.assert_array_equal(graph.vertices_in_base, other.vertices_in_base)
+        np.testing.assert_array_equal(graph.edges, other.edges)
+        np.testing.assert_array_equal(graph.confidence, other.confidence)

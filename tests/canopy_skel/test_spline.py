@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_lsq_spline
 
 from canopy_skel.cluster import BranchCluster, principal_axes
-from canopy_skel.spline import SplineConfig, direction_across, fit_spline
+from canopy_skel.spline import SplineConfig, directions_across, fit_splines
 
 LITERAL = SplineConfig(centre_shift=0.0, radius="extent")
 
@@ -19,6 +19,10 @@ def cluster_of(points, camera=(0.0, 0.0, -1.0)):
         camera_in_base=np.array(camera),
         points_in_base=np.asarray(points, float),
     )
+
+
+def fit_spline(cluster, config):
+    return fit_splines([cluster], config)[0]
 
 
 def front_of_cylinder(radius_m, seed=0, count=4000):
@@ -91,6 +95,18 @@ def test_a_rigid_motion_moves_the_spline(seed):
 
 
 def test_a_branch_that_points_at_the_camera_has_a_direction_across():
-    across = direction_across(np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.0]))
+    across = directions_across(np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, 1.0]]))[0]
     assert across @ [0, 0, 1] == pytest.approx(0.0)
     assert np.linalg.norm(across) == pytest.approx(1.0)
+
+
+def test_a_batch_gives_what_each_cluster_alone_gives():
+    clusters = [cluster_of(front_of_cylinder(r, count=n)) for r, n in ((0.003, 40), (0.02, 900))]
+    for one, spline in zip(clusters, fit_splines(clusters, SplineConfig()), strict=True):
+        alone = fit_spline(one, SplineConfig())
+        assert alone.control_points_in_base.tobytes() == spline.control_points_in_base.tobytes()
+        assert alone.radius_m == spline.radius_m
+
+
+def test_no_cluster_no_spline():
+    assert fit_splines([], SplineConfig()) == []

@@ -1,0 +1,156 @@
+"""Each stage from scratch on 70 views: the obvious way, ours, the ratio, a floor."""
+
+import resource
+
+import numpy as np
+from parts import obvious
+from parts.common import (
+    CONFIG,
+    Engine,
+    clusters_of_views,
+    least_ms,
+    segments_of_views,
+    table,
+    timed,
+    together,
+)
+from scipy.sparse.csgraph import dijkstra
+
+from canopy_skel.initial import consolidate, spanning_forest
+from canopy_skel.pathsearch import PathSearch
+from canopy_skel.spline import fit_splines
+from canopy_skel.strands import StrandMap, sample_segments
+from canopy_skel.voxels import VoxelIndex, voxels_of
+
+FRAGMENTS = 45
+HEAD = ("stage", "obvious ms", "ours ms", "ratio", "floor ms", "floor is")
+
+
+def report(quick, _output):
+    texts = []
+    for voxel_mm in (10, 5) if quick else (10, 5, 2.5):
+        texts.append(at_voxel_size(voxel_mm / 1000, 20 if quick else 70))
+    return "\n".join(texts)
+
+
+def at_voxel_size(voxel_m, views):
+    clusters = clusters_of_views(FRAGMENTS, views)
+    segments = segments_of_views(FRAGMENTS, views)
+    engine = Engine(voxel_m)
+    for one in segments:
+        engine.add(one)
+    rows = [least_squares(clusters[0]), map_update(segments[:3], voxel_m)]
+    rows += skeleton_stages(engine, segments, voxel_m)
+    rows += search_stages(engine)
+    held_mb = (engine.map.nbytes + engine.search.nbytes) / 2**20
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    title = (
+        f"{1000 * voxel_m:g} mm: {views} views, {engine.map.occupied()} voxels in"
+        f" {engine.map.blocks.count} blocks"
+    )
+    note = (
+        f"Map and search hold {held_mb:.0f} MB. Peak of this process so far, libraries and the"
+        f" obvious ways included: {peak_mb:.0f} MB.\n"
+    )
+    return table(title, HEAD, rows) + "\n" + note
+
+
+def row(name, slow, fast, floor=None, what=None):
+    return (name, slow, fast, f"{slow / fast:.1f} x", floor, what)
+
+
+def least_squares(clusters):
+    points = np.concatenate([c.points_in_base for c in clusters])
+    floor = least_ms(lambda: [points.sum(axis=0) for _ in range(3)])
+    return row(
+        f"least squares, {len(clusters)} clusters",
+        least_ms(lambda: obvious.splines(clusters)),
+        least_ms(lambda: fit_splines(clusters, CONFIG.spline), 5),
+        floor,
+        "three sums over all points",
+    )
+
+
+def map_update(segments, voxel_m):
+    dense = obvious.DenseMap((-0.5,) * 3, (2.5,) * 3, voxel_m)
+    repeats = 1 if voxel_m < 0.004 else 2
+    slow = np.median([least_ms(lambda one=one: dense.add(one), repeats) for one in segments])
+    dense = None
+    fast, support = [], []
+    for one in segments:
+        engine = Engine(voxel_m)
+        engine.map.add(one)  # blocks are allocated: as in the middle of a scan
+        fast.append(least_ms(lambda engine=engine, one=one: engine.map.add(one), 5))
+        support.append(support_of(one, voxel_m))
+    sums = np.zeros(int(np.median(support)), dtype=np.int32)
+
+    def touch():
+        sums.__iadd__(1)
+
+    what = f"one addition to each of {len(sums)} voxels in a row"
+    return row("map update, one view", slow, np.median(fast), least_ms(touch, 5), what)
+
+
+def support_of(segments, voxel_m):
+    """Return how many voxels lie in the ellipsoids of segments, counted as often as they do."""
+    length = np.linalg.norm(segments.ends_in_base - segments.starts_in_base, axis=1) / voxel_m
+    radius = segments.radius_m / voxel_m
+    return int((45 * np.pi * radius**2 * length).sum())
+
+
+def skeleton_stages(engine, segments, voxel_m):
+    points = sample_segments(together(segments), 0.5 * voxel_m)[0]
+
+    def fresh():
+        strands = StrandMap(voxel_m, CONFIG.initial.smoothing)
+        for one in segments:
+            strands.add(one)
+        return strands
+
+    strands = [fresh() for _ in range(2)]
+    moved, slow = timed(lambda: obvious.smoothed(points))
+    rows = [row("smoothing, 3 steps", slow, min(timed(s.smoothed)[1] for s in strands))]
+    smoothed = engine.strands.smoothed()
+
+    def ours():
+        vertices, _ = consolidate(smoothed, voxel_m)
+        spanning_forest(vertices, voxel_m)
+
+    slow = timed(lambda: obvious.forest(moved, voxel_m))[1]
+    rows.append(row("consolidation and forest", slow, least_ms(ours)))
+    return rows
+
+
+def scipy_search(engine, initial):
+    """Return what building the explicit graph and one Dijkstra on it take."""
+    if engine.map.voxel_size_m < 0.004:
+        return None, None  # 60 million edges: more memory than a robot's computer has
+    grid = engine.map.grid()
+    index = VoxelIndex(grid.voxels)
+    graph, build = timed(
+        lambda: obvious.explicit_graph(grid.voxels, grid.empty_probability(), index)
+    )
+    sources = index.find(voxels_of(initial.vertices_in_base, engine.map.voxel_size_m))
+    return build, timed(lambda: dijkstra(graph, indices=sources, min_only=True))[1]
+
+
+def search_stages(engine):
+    initial = engine.observed()
+    build, single = scipy_search(engine, initial)
+
+    def scratch():
+        search = PathSearch(engine.map)
+        search.update(initial)
+        return search, search.joins()
+
+    (search, joins), ours = min((timed(scratch) for _ in range(2)), key=lambda r: r[1])
+    engine.search = search
+    if single is None:
+        return [("Algorithm 1", None, ours, None, None, None)]
+    pieces = initial.components()[0]
+    runs = sum(range(pieces - len(joins), pieces + 1))
+    cheapest = f"one such Dijkstra, graph not counted ({build:.0f} ms)"
+    return [
+        row("Algorithm 1 / one scipy Dijkstra", single, ours, single, cheapest),
+        row(f"Algorithm 1 / literal, {runs} Dijkstras (extrapolated)", runs * single, ours),
+    ]

@@ -1,0 +1,56 @@
+"""A fresh skeleton after every view: what each stage of it costs, and against a new start."""
+
+import numpy as np
+from parts.common import CONFIG, Engine, clusters_of_views, table, timed
+
+from canopy_skel.likelihood import segments_of
+from canopy_skel.pathsearch import PathSearch
+from canopy_skel.spline import fit_splines
+
+STAGES = ("fit", "map", "strands", "initial", "repair", "preview", "joins", "paths")
+
+
+def report(quick, _output):
+    rows = []
+    for voxel_mm in (10, 5) if quick else (10, 5, 2.5):
+        for fragments in (45, 300):
+            views = 20 if quick or voxel_mm < 4 else 70
+            rows.append(row_of(voxel_mm / 1000, fragments, views))
+    head = ("mm", "fragments seen", "views", *STAGES, "**all**", "all, most", "scratch / repair")
+    text = table("A fresh skeleton after every view: median ms of the last ten views", head, rows)
+    return text + (
+        "\n`all` leaves out masks, clusters and the preview. `scratch / repair` is a new search"
+        " over the repair of the old one; distances were compared and are equal to the bit.\n"
+    )
+
+
+def row_of(voxel_m, fragments, views):
+    engine, times = Engine(voxel_m), []
+    for clusters in clusters_of_views(fragments, views):
+        times.append(update(engine, clusters)[0])
+    initial, repair = engine.observed(), np.median([t["repair"] for t in times[-10:]])
+    fresh = PathSearch(engine.map)
+    scratch = timed(lambda: fresh.update(initial))[1]
+    if not np.array_equal(fresh.distances, engine.search.distances):
+        raise SystemExit("the repaired distances are not those of a new search")
+    last = times[-10:]
+    whole = [sum(t[s] for s in STAGES if s != "preview") for t in last]
+    medians = [float(np.median([t[s] for t in last])) for s in STAGES]
+    pieces = initial.components()[0]
+    ratio = f"{scratch:.0f} / {repair:.0f} = {scratch / repair:.0f} x"
+    return (1000 * voxel_m, pieces, views, *medians, float(np.median(whole)), max(whole), ratio)
+
+
+def update(engine, clusters):
+    """Add a view; return what each stage took and the skeleton."""
+    ms = {}
+    splines, ms["fit"] = timed(lambda: fit_splines(clusters, CONFIG.spline))
+    segments = segments_of(splines)
+    _, ms["map"] = timed(lambda: engine.map.add(segments))
+    _, ms["strands"] = timed(lambda: engine.strands.add(segments))
+    initial, ms["initial"] = timed(engine.observed)
+    _, ms["repair"] = timed(lambda: engine.search.update(initial))
+    _, ms["preview"] = timed(lambda: engine.joined(initial, engine.search.preview()))
+    joins, ms["joins"] = timed(engine.search.joins)
+    graph, ms["paths"] = timed(lambda: engine.joined(initial, joins))
+    return ms, graph

@@ -1,0 +1,228 @@
+"""Principal axes and degree-one least squares of many point clusters at once (paper III-C).
+
+Clusters lie one after the other: points of cluster i are start[i] to start[i + 1].
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+SWEEPS = 12
+
+
+@njit("void(float64[:,::1], float64[:,::1])", cache=True, nogil=True)
+def diagonalise(matrix: Floats, vectors: Floats) -> None:
+    """Turn a symmetric 3 x 3 matrix diagonal by Jacobi rotations; columns of `vectors` follow."""
+    for i in range(3):
+        for j in range(3):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(SWEEPS):
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if abs(matrix[p, q]) <= 1e-18 * (matrix[p, p] + matrix[q, q]):
+                    continue
+                theta = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
+                sign = 1.0 if theta >= 0.0 else -1.0
+                t = sign / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for i in range(3):
+                    a, b = matrix[i, p], matrix[i, q]
+                    matrix[i, p], matrix[i, q] = c * a - s * b, s * a + c * b
+                for i in range(3):
+                    a, b = matrix[p, i], matrix[q, i]
+                    matrix[p, i], matrix[q, i] = c * a - s * b, s * a + c * b
+                for i in range(3):
+                    a, b = vectors[i, p], vectors[i, q]
+                    vectors[i, p], vectors[i, q] = c * a - s * b, s * a + c * b
+
+
+@njit("void(float64[:,::1], int64, int64, float64[:,::1], float64[::1])", cache=True, nogil=True)
+def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Floats) -> None:
+    """Write the principal axes of points [first, end) as rows, longest first, and their mean.
+
+    The sign of an axis is canonical: its largest component is positive.
+    """
+    spread, vectors = np.zeros((3, 3)), np.empty((3, 3))
+    mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
+    for n in range(first, end):
+        mx, my, mz = mx + points[n, 0], my + points[n, 1], mz + points[n, 2]
+    mx, my, mz = mx / (end - first), my / (end - first), mz / (end - first)
+    for n in range(first, end):
+        x, y, z = points[n, 0] - mx, points[n, 1] - my, points[n, 2] - mz
+        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+    mean[0], mean[1], mean[2] = mx, my, mz
+    spread[0, 0], spread[1, 1], spread[2, 2] = xx, yy, zz
+    spread[0, 1] = spread[1, 0] = xy
+    spread[0, 2] = spread[2, 0] = xz
+    spread[1, 2] = spread[2, 1] = yz
+    diagonalise(spread, vectors)
+    used = np.zeros(3)
+    for row in range(3):
+        best = -1
+        for j in range(3):
+            if used[j] == 0.0 and (best < 0 or spread[j, j] > spread[best, best]):
+                best = j
+        used[best] = 1.0
+        largest = 0
+        for i in range(1, 3):
+            if abs(vectors[i, best]) > abs(vectors[largest, best]):
+                largest = i
+        sign = 1.0 if vectors[largest, best] > 0.0 else -1.0
+        for i in range(3):
+            axes[row, i] = sign * vectors[i, best]
+
+
+@njit(
+    "void(float64[:,::1], int64, int64, float64[::1], int64, float64[:,::1], float64[::1],"
+    " float64[:,::1])",
+    cache=True,
+    nogil=True,
+)
+def normal_equations(
+    points: Floats,
+    first: int,
+    end: int,
+    along: Floats,
+    count: int,
+    matrix: Floats,
+    weight: Floats,
+    right: Floats,
+) -> None:
+    """Write the tridiagonal normal matrix (diagonal, off-diagonal), basis sums and right sides."""
+    for i in range(count):
+        matrix[i, 0] = matrix[i, 1] = weight[i] = 0.0
+        right[i, 0] = right[i, 1] = right[i, 2] = 0.0
+    for n in range(first, end):
+        place = along[n - first] * (count - 1)
+        i = min(int(place), count - 2)
+        b = place - i
+        a = 1.0 - b
+        weight[i] += a
+        weight[i + 1] += b
+        matrix[i, 0] += a * a
+        matrix[i, 1] += a * b
+        matrix[i + 1, 0] += b * b
+        for j in range(3):
+            right[i, j] += a * points[n, j]
+            right[i + 1, j] += b * points[n, j]
+
+
+@njit("void(float64[:,::1], float64[:,::1], int64)", cache=True, nogil=True)
+def solve(matrix: Floats, right: Floats, count: int) -> None:
+    """Solve the tridiagonal system in place (Cholesky without roots: it is positive definite)."""
+    for i in range(1, count):
+        factor = matrix[i - 1, 1] / matrix[i - 1, 0]
+        matrix[i, 0] -= factor * matrix[i - 1, 1]
+        for j in range(3):
+            right[i, j] -= factor * right[i - 1, j]
+    for back in range(count):
+        i = count - 1 - back
+        for j in range(3):
+            if back > 0:
+                right[i, j] -= matrix[i, 1] * right[i + 1, j]
+            right[i, j] /= matrix[i, 0]
+
+
+@njit(
+    "void(float64[:,::1], int64[::1], int64, float64, float64[:,:,::1], float64[:,:,::1],"
+    " float64[:,::1], int64[::1])",
+    cache=True,
+    nogil=True,
+)
+def fit_splines(
+    points: Floats,
+    start: Ints,
+    most: int,
+    min_weight: float,
+    controls: Floats,
+    axes: Floats,
+    means: Floats,
+    counts: Ints,
+) -> None:
+    """Fit a spline of up to `most` control points, uniform knots along PC1, to every cluster.
+
+    Writes the control points (C, most, 3), principal axes (C, 3, 3), means (C, 3) and the numbers
+    of control points: fewer where some would have points of less than `min_weight`.
+    """
+    longest = 0
+    for c in range(len(start) - 1):
+        longest = max(longest, start[c + 1] - start[c])
+    along, matrix, weight = np.empty(longest), np.empty((most, 2)), np.empty(most)
+    for c in range(len(start) - 1):
+        first, end = start[c], start[c + 1]
+        principal_frame(points, first, end, axes[c], means[c])
+        ax, ay, az = axes[c, 0, 0], axes[c, 0, 1], axes[c, 0, 2]
+        shift = means[c, 0] * ax + means[c, 1] * ay + means[c, 2] * az
+        low, high = math.inf, -math.inf
+        for n in range(first, end):
+            t = points[n, 0] * ax + points[n, 1] * ay + points[n, 2] * az - shift
+            along[n - first] = t
+            low, high = min(low, t), max(high, t)
+        scale = 1.0 / max(high - low, 1e-12)
+        for n in range(end - first):
+            along[n] = min((along[n] - low) * scale, 1.0)
+        count, enough = most, False
+        while not enough:
+            normal_equations(points, first, end, along, count, matrix, weight, controls[c])
+            enough = count == 2
+            lightest = math.inf
+            for i in range(count):
+                lightest = min(lightest, weight[i])
+            if not enough and lightest < min_weight:
+                count -= 1
+            else:
+                enough = True
+        solve(matrix, controls[c], count)
+        counts[c] = count
+
+
+@njit(
+    "void(float64[:,::1], int64[::1], float64[:,:,::1], float64[:,:,::1], int64[::1],"
+    " float64[:,::1], float64[:,::1])",
+    cache=True,
+    nogil=True,
+)
+def half_widths(
+    points: Floats,
+    start: Ints,
+    controls: Floats,
+    axes: Floats,
+    counts: Ints,
+    rays: Floats,
+    widths: Floats,
+) -> None:
+    """Write half the extent along PC2, and sqrt(3) deviations from the spline across the rays."""
+    for c in range(len(start) - 1):
+        first, end, count = start[c], start[c + 1], counts[c]
+        ax, ay, az = axes[c, 0, 0], axes[c, 0, 1], axes[c, 0, 2]
+        bx, by, bz = axes[c, 1, 0], axes[c, 1, 1], axes[c, 1, 2]
+        sx = rays[c, 1] * az - rays[c, 2] * ay
+        sy = rays[c, 2] * ax - rays[c, 0] * az
+        sz = rays[c, 0] * ay - rays[c, 1] * ax
+        near, far, low, high = math.inf, -math.inf, math.inf, -math.inf
+        for n in range(first, end):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            t, u = x * ax + y * ay + z * az, x * bx + y * by + z * bz
+            near, far, low, high = min(near, t), max(far, t), min(low, u), max(high, u)
+        scale = (count - 1) / max(far - near, 1e-12)
+        total = squares = 0.0
+        for n in range(first, end):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            place = (x * ax + y * ay + z * az - near) * scale
+            k = min(int(place), count - 2)
+            b = place - k
+            a = 1.0 - b
+            off = sx * (x - a * controls[c, k, 0] - b * controls[c, k + 1, 0])
+            off += sy * (y - a * controls[c, k, 1] - b * controls[c, k + 1, 1])
+            off += sz * (z - a * controls[c, k, 2] - b * controls[c, k + 1, 2])
+            total += off
+            squares += off * off
+        mean = total / (end - first)
+        variance = max(squares / (end - first) - mean * mean, 0.0)
+        widths[c, 0], widths[c, 1] = (high - low) / 2.0, math.sqrt(3.0 * variance)

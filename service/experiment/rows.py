@@ -1,0 +1,155 @@
+"""One row per tree, segmenter and method, kept in a file that any interruption leaves usable."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import version
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from canopy_skel.errors import UsageError
+from service.experiment.orchard import Tree
+
+Value = float | int | bool | str | None
+_SHORT = 12
+_MEASURE = "experiment/measure.py"
+_UNCONCERNED = ("drivers/oak", "drivers/ur5")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Row:
+    """What a method made of a tree with a segmenter's masks.
+
+    values: scores and other figures by name; only `error` where it failed.
+    """
+
+    tree: Tree
+    segmenter: str
+    method: str
+    config_sha256: str
+    values: Mapping[str, Value]
+
+    @property
+    def key(self) -> str:
+        """Return what the row follows from: recording, segmenter, method with settings, code."""
+        return key_of(self.tree, self.segmenter, self.method, self.config_sha256)
+
+    @property
+    def failed(self) -> bool:
+        """Whether there are no figures."""
+        return "error" in self.values
+
+    def number(self, name: str) -> float | None:
+        """Return a figure, None where the row has none."""
+        value = self.values.get(name)
+        return None if value is None or isinstance(value, str) else float(value)
+
+    def flat(self) -> dict[str, Value]:
+        """Return everything in one level, for a table of all rows."""
+        tree: dict[str, Value] = {name: getattr(self.tree, name) for name in Tree.__slots__}
+        tree["simulated_v_det"] = tree.pop("v_det")
+        own = {"segmenter": self.segmenter, "method": self.method}
+        return {**tree, **own, "config_sha256": self.config_sha256, **self.values}
+
+
+def key_of(tree: Tree, segmenter: str, method: str, config_sha256: str) -> str:
+    """Return the key of a row; see `Row.key`."""
+    parts = (
+        tree.sha256[:_SHORT],
+        segmenter,
+        method,
+        config_sha256[:_SHORT],
+        code_sha256()[:_SHORT],
+    )
+    return "/".join(parts)
+
+
+@cache
+def code_sha256() -> str:
+    """Return the hash of the version and of all code that rows depend on."""
+    digest = sha256(version("canopy-skel").encode())
+    sources = [
+        source
+        for package in ("canopy_skel", "drivers")
+        for source in _sources(files(package), package)
+    ]
+    sources.append((_MEASURE, files("service").joinpath(_MEASURE).read_bytes()))
+    for path, data in sorted(sources):
+        if not path.startswith(_UNCONCERNED):
+            digest.update(path.encode() + b"\0" + data + b"\0")
+    return digest.hexdigest()
+
+
+def _sources(folder: Traversable, name: str) -> Iterator[tuple[str, bytes]]:
+    for entry in folder.iterdir():
+        path = f"{name}/{entry.name}"
+        if entry.is_dir():
+            yield from _sources(entry, path)
+        elif entry.name.endswith(".py"):
+            yield path, entry.read_bytes()
+
+
+class RowStore:
+    """Rows by key in a file of one JSON object a line; only one process may write it."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the rows that are there; a line that was cut off is taken away.
+
+        Raises:
+            UsageError: the file is no row store.
+        """
+        self._path = path
+        self._rows: dict[str, Row] = {}
+        if path.exists():
+            data = path.read_bytes()
+            whole = data[: data.rfind(b"\n") + 1]
+            if len(whole) < len(data):
+                os.truncate(path, len(whole))
+            for number, line in enumerate(whole.splitlines(), start=1):
+                self._read(line, number)
+
+    def __contains__(self, key: str) -> bool:
+        """Whether a row with figures is there; what failed is tried again."""
+        return key in self._rows and not self._rows[key].failed
+
+    def get(self, keys: Iterable[str]) -> list[Row]:
+        """Return the rows that are there, in the order of the keys."""
+        return [self._rows[key] for key in keys if key in self._rows]
+
+    @contextmanager
+    def adding(self) -> Iterator[Callable[[Row], None]]:
+        """Open the file for further rows."""
+        with self._path.open("ab") as stream:
+
+            def add(row: Row) -> None:
+                fields = {
+                    "key": row.key,
+                    "tree": {name: getattr(row.tree, name) for name in Tree.__slots__},
+                    "segmenter": row.segmenter,
+                    "method": row.method,
+                    "config_sha256": row.config_sha256,
+                    "values": dict(row.values),
+                }
+                stream.write(json.dumps(fields).encode() + b"\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+                self._rows[row.key] = row
+
+            yield add
+
+    def _read(self, line: bytes, number: int) -> None:
+        try:
+            fields = json.loads(line)
+            key = fields.pop("key")
+            tree = Tree(**fields.pop("tree"))
+            self._rows[key] = Row(tree=tree, **fields)
+        except (ValueError, KeyError, TypeError) as error:
+            raise UsageError(
+                f"{self._path}: line {number} is no row of an experiment ({error}); give another"
+                " output folder, or delete the file to start over"
+            ) from error
