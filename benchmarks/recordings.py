@@ -13,7 +13,7 @@ from pathlib import Path
 from time import perf_counter
 
 CANOPY = Path(sys.executable).with_name("canopy")
-METHODS = ("paper", "mst", "ftsem")
+METHODS = ("canopy", "paper", "mst", "ftsem")
 COLUMNS = {
     "precision": "P",
     "precision_directional": "P_dir",

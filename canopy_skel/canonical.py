@@ -16,6 +16,7 @@ def canonical_order(graph: SkeletonGraph) -> IntArray:
     """
     keys = np.column_stack(
         [graph.vertices_in_base, graph.radius_m, graph.confidence, graph.occluded]
+        + ([] if graph.source is None else [graph.source])
     )
     order = np.lexsort(keys.T[::-1])
     changed = np.any(keys[order[1:]] != keys[order[:-1]], axis=1)
@@ -36,6 +37,7 @@ def renumbered(graph: SkeletonGraph, old_of_new: IntArray) -> SkeletonGraph:
         radius_m=graph.radius_m[old_of_new],
         occluded=graph.occluded[old_of_new],
         confidence=graph.confidence[old_of_new],
+        source=None if graph.source is None else graph.source[old_of_new],
     )
 
 

@@ -3,14 +3,14 @@
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from canopy_skel.errors import DocumentError
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.graph import SkeletonGraph
+from canopy_skel.graph import SOURCES, SkeletonGraph
 from canopy_skel.hierarchy import BranchPath, build_hierarchy
 from canopy_skel.schema import SCHEMA_NAME, checked
 
@@ -129,6 +129,9 @@ def build_document(
         branches=tuple(_branch(i, path, tree) for i, path in enumerate(hierarchy.branches)),
         root=0 if len(tree.vertices_in_base) else None,
         components=tree.components()[0],
+        extra={}
+        if tree.source is None
+        else {"source": tuple(SOURCES[code] for code in tree.source.tolist())},
         preview=preview,
     )
 
@@ -265,11 +268,10 @@ def _branch(index: int, path: BranchPath, tree: SkeletonGraph) -> Branch:
 
 
 def _rounded(graph: SkeletonGraph) -> SkeletonGraph:
-    return SkeletonGraph(
+    return replace(
+        graph,
         vertices_in_base=_rounded_array(graph.vertices_in_base, _METRE_DECIMALS),
-        edges=graph.edges,
         radius_m=_rounded_array(graph.radius_m, _METRE_DECIMALS),
-        occluded=graph.occluded,
         confidence=_rounded_array(graph.confidence, _CONFIDENCE_DECIMALS),
     )
 

@@ -8,6 +8,8 @@ from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 
+SOURCES = ("observed", "fragment", "link", "extension")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class SkeletonGraph:
@@ -15,6 +17,7 @@ class SkeletonGraph:
 
     vertices_in_base: (V, 3) metres. edges: (E, 2) vertex indices. radius_m: (V,).
     occluded: (V,) bool, predicted by a search and not observed. confidence: (V,) in [0, 1].
+    source: (V,) how each vertex is known, an index into SOURCES; None where nobody says.
     """
 
     vertices_in_base: FloatArray
@@ -22,6 +25,7 @@ class SkeletonGraph:
     radius_m: FloatArray
     occluded: BoolArray
     confidence: FloatArray
+    source: IntArray | None = None
 
     def __post_init__(self) -> None:
         """Freeze the arrays: graphs are values."""
@@ -33,6 +37,8 @@ class SkeletonGraph:
             self.confidence,
         ):
             array.setflags(write=False)
+        if self.source is not None:
+            self.source.setflags(write=False)
 
     def components(self) -> tuple[int, IntArray]:
         """Return the number of connected components and the component of each vertex (V,)."""

@@ -1,7 +1,7 @@
 """Views in, one growing likelihood map, a skeleton out: the whole method in the paper's order."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -9,9 +9,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from canopy_skel.assemble import skeleton_of
 from canopy_skel.baselines.ftsem import FtsemConfig, join_break_points
 from canopy_skel.baselines.mst import join_by_spanning_tree
+from canopy_skel.canopy import CanopyConfig, CanopyScan
 from canopy_skel.cluster import ClusterConfig, RejectedInstance, cluster_branches
+from canopy_skel.confidence import shipped_models
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
@@ -19,11 +22,13 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
-from canopy_skel.segment import Segmenter
+from canopy_skel.poses import PoseCorrection
+from canopy_skel.segment import BranchMask, Segmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_splines
 from canopy_skel.strands import StrandMap
+from canopy_skel.wood import wood_of
 
-MethodName = Literal["paper", "mst", "ftsem"]
+MethodName = Literal["canopy", "paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
 JOINERS: frozenset[MethodName] = frozenset({"paper", "mst", "ftsem"})
 """Methods that differ only in how they join the observed skeleton."""
@@ -39,6 +44,7 @@ class MethodConfig:
     """A method by name and the settings of its stages.
 
     straighten_steps: how often predicted vertices are moved to the mean of their neighbours.
+    Method `canopy` uses `canopy` and `likelihood`, the others everything else.
     """
 
     name: MethodName = "paper"
@@ -48,6 +54,7 @@ class MethodConfig:
     initial: InitialConfig = field(default_factory=InitialConfig)
     ftsem: FtsemConfig = field(default_factory=FtsemConfig)
     straighten_steps: int = 10
+    canopy: CanopyConfig = field(default_factory=CanopyConfig)
 
     def __post_init__(self) -> None:
         """Refuse a method that is not known."""
@@ -56,7 +63,10 @@ class MethodConfig:
 
     def sha256(self) -> str:
         """Return the hash that names this configuration in documents."""
-        return sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+        fields = asdict(self)
+        if self.name != "canopy":
+            del fields["canopy"]
+        return sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -64,6 +74,7 @@ class Extraction:
     """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1.
 
     preview: the joins are those of a spanning tree instead.
+    corrections: of views whose poses were off (method `canopy`).
     """
 
     graph: SkeletonGraph
@@ -71,6 +82,7 @@ class Extraction:
     observed_components: int
     joins: tuple[Join, ...]
     preview: bool = False
+    corrections: tuple[PoseCorrection, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -100,6 +112,7 @@ class Skeletonizer:
         self._stage = stage
         self._memory_limit_bytes = memory_limit_bytes
         self._known: dict[int, _Known] = {}
+        self._canopy = CanopyScan(config.canopy)
         self._start()
 
     def _start(self) -> None:
@@ -144,6 +157,8 @@ class Skeletonizer:
         self._check_place(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
+        if self._config.name == "canopy":
+            return self._observe(view, masks)
         with self._stage("cluster"):
             clusters, rejected = cluster_branches(view, masks, self._config.cluster)
         with self._stage("spline"):
@@ -158,6 +173,28 @@ class Skeletonizer:
         )
         return len(splines)
 
+    def _observe(self, view: View, masks: Sequence[BranchMask]) -> int:
+        with self._stage("observe"):
+            seen = self._canopy.observe(view, masks, wood_of(self._segmenter, view))
+        with self._stage("likelihood"):
+            self._add(seen.splines)
+        with self._stage("evidence"):
+            self._canopy.add(view.index, seen)
+        self._known[view.index] = _Known(
+            camera_in_base=view.base_from_camera[:3, 3],
+            splines=seen.splines,
+            instances=len(masks),
+            rejected=[
+                RejectedInstance(
+                    view_index=view.index,
+                    instance=instance,
+                    reason="too few points with trusted depth",
+                )
+                for instance in seen.dropped
+            ],
+        )
+        return len(seen.splines)
+
     def remove_view(self, index: int) -> None:
         """Take a view off again, as if it had never been in.
 
@@ -167,6 +204,7 @@ class Skeletonizer:
         if index not in self._known:
             raise UsageError(f"view {index} is not in, so it cannot be removed")
         gone = self._known.pop(index)
+        self._canopy.remove(index)
         if self._map.saturated:
             # What a sum has lost at its limit cannot be told: begin again.
             self._start()
@@ -175,13 +213,15 @@ class Skeletonizer:
             return
         segments = segments_of(gone.splines)
         self._map.remove(segments)
-        self._strands.remove(segments)
+        if self._config.name != "canopy":
+            self._strands.remove(segments)
         self._initial = None
 
     def _add(self, splines: list[BranchSpline]) -> None:
         segments = segments_of(splines)
         self._map.add(segments)
-        self._strands.add(segments)
+        if self._config.name != "canopy":
+            self._strands.add(segments)
         self._initial = None
 
     def _check_place(self, view: View) -> None:
@@ -210,6 +250,9 @@ class Skeletonizer:
                 f"{name} and {self._config.name} differ before the joins: give each its own"
                 " Skeletonizer"
             )
+        if name == "canopy":
+            with self._stage("canopy"):
+                return self._canopy_skeleton()
         initial = self._observed()
         joins: list[Join] = []
         search = self._repaired(initial) if name == "paper" else None
@@ -266,4 +309,14 @@ class Skeletonizer:
             observed_components=initial.components()[0],
             joins=tuple(joins),
             preview=preview,
+        )
+
+    def _canopy_skeleton(self) -> Extraction:
+        joined = skeleton_of(self._canopy, self._map, shipped_models())
+        return Extraction(
+            graph=joined.graph,
+            voxels=self._map.occupied(),
+            observed_components=joined.observed_components,
+            joins=(),
+            corrections=joined.corrections,
         )

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
 from canopy_skel.baselines.ftsem import FtsemConfig
+from canopy_skel.canopy import canopy_config_from
 from canopy_skel.cluster import ClusterConfig
 from canopy_skel.errors import UsageError
 from canopy_skel.initial import InitialConfig
@@ -137,7 +138,8 @@ def _messages(rows: list[list[Any]], body: bytes) -> tuple[Message, ...]:
 
 def _config(fields: Mapping[str, Any]) -> MethodConfig:
     stages = {name: stage(**fields[name]) for name, stage in _STAGES.items()}
-    return MethodConfig(**{**fields, **stages})
+    canopy = canopy_config_from(fields["canopy"])
+    return MethodConfig(**{**fields, **stages, "canopy": canopy})
 
 
 def _typed(value: object, kind: type[_T]) -> _T:

@@ -191,6 +191,14 @@ def _summary(
                 for join in extraction.joins
             ],
         },
+        "poses": [
+            {
+                "before_mm": round(1000 * one.before_m, 2),
+                "after_mm": round(1000 * one.after_m, 2),
+                "view": skeletonizer.views[one.view],
+            }
+            for one in extraction.corrections
+        ],
         "skeleton": {
             "vertices": len(document.position),
             "branches": len(document.branches),

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
+from canopy_skel.canopy import CanopyConfig
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.exports import FORMATS
 from canopy_skel.likelihood import LikelihoodConfig
@@ -25,7 +26,7 @@ MOST_MAP_MEMORY = 3 << 30
 def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "canopy",
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")] = "recorded",
     weights: Annotated[Path | None, typer.Option(help="Weights of the segmenter (.pt).")] = None,
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
@@ -34,6 +35,13 @@ def replay(
         list[str] | None,
         typer.Option(help="ROLE=NAME, e.g. color_image=/rgb or base_frame=base_link; repeatable."),
     ] = None,
+    fragments: Annotated[
+        bool, typer.Option(help="Use small wood outside the masks (method canopy).")
+    ] = True,
+    rooted: Annotated[
+        bool,
+        typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Turn recordings into skeletons, with an overlay picture and a summary for each."""
@@ -41,6 +49,7 @@ def replay(
         config=MethodConfig(
             name=method,  # type: ignore[arg-type]  # MethodConfig names the known ones
             likelihood=LikelihoodConfig(voxel_size_m=voxel),
+            canopy=CanopyConfig(use_fragments=fragments, rooted=rooted),
         ),
         segmenter=segmenter,
         weights=weights,

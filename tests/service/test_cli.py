@@ -8,9 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scenes.wood import view_from
+from scenes.leaves import leafy_view
+from scenes.wood import WOOD, view_from
 
-from canopy_skel.document import from_json
+from canopy_skel.confidence import models_from
+from canopy_skel.document import Method, build_document, from_json, to_json
+from canopy_skel.graph import SkeletonGraph
 from canopy_skel.recording import RecordingWriter
 from service import cli
 
@@ -38,17 +41,48 @@ def recording(tmp_path):
     return path
 
 
-def write(path, views):
+def write(path, views, truth=None):
     metadata = {"scan_id": "sticks-1"}
     with RecordingWriter(path, metadata, tool_from_camera=np.eye(4)) as writer:
         for view in views:
             writer.write_view(view)
+        if truth is not None:
+            writer.attach("ground_truth_skeleton.json", "application/json", truth)
+
+
+def test_fit_confidence_writes_models_that_know_where_they_come_from(canopy, tmp_path):
+    path, models = tmp_path / "leafy.mcap", tmp_path / "models.json"
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)])
+    code, _, stderr = canopy("fit-confidence", path, "-o", models)
+    assert (code, "no true skeleton is attached" in stderr) == (1, True)
+    truth = build_document(
+        sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0
+    )
+    path.unlink()
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)], to_json(truth))
+    code, stdout, _ = canopy("fit-confidence", path, "-o", models, "--held-out", path)
+    assert code == 0
+    assert stdout.startswith("leafy: instance_point 0.")
+    assert models_from(json.loads(models.read_bytes())).provenance == "fitted to 1 scans: leafy"
+
+
+def sticks():
+    points = np.array([point for start, end, _ in WOOD for point in (start, end)])
+    return SkeletonGraph(
+        vertices_in_base=points,
+        edges=np.arange(6).reshape(3, 2),
+        radius_m=np.full(6, 0.01),
+        occluded=np.zeros(6, dtype=bool),
+        confidence=np.ones(6),
+    )
 
 
 def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path):
     out = tmp_path / "out"
     formats = "json,glb,swc,ply,csv,graphml"
-    code, stdout, _ = canopy("replay", recording, "-o", out, "--formats", formats)
+    code, stdout, _ = canopy(
+        "replay", recording, "-o", out, "--formats", formats, "--method", "paper"
+    )
     assert code == 0
     names = [f"sticks.skeleton.{name}" for name in formats.split(",")]
     names += ["sticks.overlay.png", "sticks.summary.json"]
@@ -63,6 +97,17 @@ def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path)
     assert summary["joins"]["observed_components"] == 1 + len(summary["joins"]["paths"])
     assert summary["map"]["occupied_voxels"] > 1000
     assert set(summary["seconds"]) >= {"read", "cluster", "spline", "likelihood", "initial", "join"}
+
+
+def test_canopy_is_the_method_unless_another_is_named(canopy, recording, tmp_path):
+    assert canopy("replay", recording, "-o", tmp_path, "--rooted")[0] == 0
+    document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())
+    assert document.method.name == "canopy"
+    assert document.components == 1
+    assert set(document.extra["source"]) == {"observed", "link"}
+    summary = json.loads((tmp_path / "sticks.summary.json").read_text())
+    assert summary["poses"] == []
+    assert set(summary["seconds"]) >= {"read", "observe", "evidence", "likelihood", "canopy"}
 
 
 def test_the_same_recording_gives_the_same_bytes(canopy, recording, tmp_path):
@@ -82,7 +127,7 @@ def test_json_on_stdout_is_all_there_is_on_stdout(canopy, recording, tmp_path):
 
 
 def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
-    for method in ("paper", "mst", "ftsem"):
+    for method in ("canopy", "paper", "mst", "ftsem"):
         code, _, _ = canopy("replay", recording, "-o", tmp_path / method, "--method", method)
         assert code == 0
         document = from_json((tmp_path / method / "sticks.skeleton.json").read_bytes())
@@ -92,7 +137,7 @@ def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--method", "best"], "unknown method 'best': choose one of paper, mst, ftsem"),
+        (["--method", "best"], "unknown method 'best': choose one of canopy, paper, mst, ftsem"),
         (["--segmenter", "eyes"], "unknown segmenter 'eyes': choose one of recorded"),
         (["--formats", "json,obj"], "unknown format 'obj': choose from json"),
         (["--voxel", "0"], "voxel size 0.0 m: give a length above 0"),

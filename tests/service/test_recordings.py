@@ -55,6 +55,16 @@ def test_the_paper_mode_is_not_below_the_baselines(scores_of, name, baseline):
     assert scores_of(name, "paper")["precision"] >= scores_of(name, baseline)["precision"]
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_canopy_sees_more_than_paper_and_says_how_sure_it_is(scores_of, name):
+    paper, canopy = scores_of(name, "paper"), scores_of(name, "canopy")
+    assert canopy["precision"] >= 0.9
+    assert canopy["recall"] >= 1.08 * paper["recall"]
+    assert canopy["recall_unmasked"] >= 1.5 * paper["recall_unmasked"]
+    assert canopy["ece"] <= 0.08
+    assert canopy["acyclic"]
+
+
 def test_most_gaps_are_joined(scores_of):
     joined = [scores_of(name, "paper")["joined"] for name in NAMES]
     assert sum(joined) / len(joined) >= 0.6

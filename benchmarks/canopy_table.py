@@ -1,0 +1,212 @@
+"""Method canopy beside method paper: the figures it must reach, on given recordings with truth.
+
+python benchmarks/canopy_table.py REC... --output docs/results/canopy.md --cache out/canopy-table
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from canopy_skel.canopy import CanopyConfig
+from canopy_skel.document import Method, build_document, from_json
+from canopy_skel.fitting import truth_points
+from canopy_skel.metrics import score
+from canopy_skel.pipeline import MethodConfig, Skeletonizer
+from canopy_skel.recording import read_recording
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+from drivers.stereo import with_depth
+
+RUNS = {
+    "paper": MethodConfig(name="paper"),
+    "masks": MethodConfig(name="canopy", canopy=CanopyConfig(use_fragments=False)),
+    "fragments": MethodConfig(name="canopy"),
+}
+LABELS = {
+    "paper": "paper",
+    "masks": "canopy, masks only",
+    "fragments": "canopy, colour fragments",
+}
+FIGURES = {
+    "precision": "P",
+    "precision_directional": "P_dir",
+    "recall": "R",
+    "recall_unmasked": "R unmasked",
+    "recall_hidden": "R hidden",
+    "occ_precision": "occ P",
+    "joined": "joined",
+    "length_ratio": "length ratio",
+    "radius_error_median": "radius err",
+    "ece": "ECE",
+    "ece_occluded": "ECE pred.",
+    "auc": "auc",
+    "components": "parts",
+    "view_ms": "ms/view",
+}
+BINS = 10
+INTRODUCTION = """# Method canopy beside method paper
+
+Made by `benchmarks/canopy_table.py` from simulated trees that nothing was fitted to. Columns are
+explained in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton
+after it, without segmentation. The number behind a recording is the share of its truth that no mask
+covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated ones;
+fragments are found by colour, and simulated colours are not an orchard's.
+
+![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
+
+"""
+CLASSES = ("light", "medium", "heavy")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", type=Path, nargs="+")
+    parser.add_argument("--output", type=Path)
+    parser.add_argument("--cache", type=Path, required=True, help="where finished figures are kept")
+    arguments = parser.parse_args()
+    arguments.cache.mkdir(parents=True, exist_ok=True)
+    results = {path.stem: figures_of(path, arguments.cache) for path in arguments.recordings}
+    page = "\n".join([*class_tables(results), *recording_table(results)]) + "\n"
+    if arguments.output:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.write_text(INTRODUCTION + page)
+        for name in ("masks", "fragments"):
+            picture = arguments.output.with_name(f"{arguments.output.stem}-reliability-{name}.svg")
+            picture.write_text(reliability_diagram(results, name))
+    print(page)
+
+
+def figures_of(path, cache):
+    """Return the figures of all runs of one recording, from the cache where they are there."""
+    kept = cache / f"{path.stem}.json"
+    if kept.exists():
+        return json.loads(kept.read_text())
+    recording = read_recording(path)
+    views = [with_depth(view) for view in recording.views()]
+    truth = from_json(recording.ground_truth)
+    results = {"unmasked": unmasked_share(truth)}
+    for name, config in RUNS.items():
+        results[name] = run(views, truth, config)
+    kept.write_text(json.dumps(results))
+    return results
+
+
+def run(views, truth, config):
+    maker = Skeletonizer(RecordedSegmenter(), replace(config))
+    for view in views[:-1]:
+        maker.add_view(view)
+    started = time.process_time()
+    maker.add_view(views[-1])
+    graph = maker.skeleton().graph
+    view_ms = 1000 * (time.process_time() - started)
+    document = build_document(
+        graph,
+        scan_id="table",
+        revision=len(views),
+        method=Method(name=config.name),
+        views_used=len(views),
+    )
+    return score(document, truth).to_dict() | {
+        "view_ms": view_ms,
+        "reliability": reliability(document, truth),
+    }
+
+
+def reliability(document, truth):
+    """Return per part and bin of confidence [vertices, sum of confidence, right ones]."""
+    distance = truth_points(truth).query(document.position)[0]
+    which = np.clip((document.confidence * BINS).astype(int), 0, BINS - 1)
+    table = {}
+    for part, chosen in (("observed", ~document.occluded), ("predicted", document.occluded)):
+        columns = (np.ones(len(distance)), document.confidence, distance <= 0.02)
+        sums = [np.bincount(which[chosen], c[chosen], BINS).tolist() for c in columns]
+        table[part] = list(zip(*sums, strict=True))
+    return table
+
+
+def unmasked_share(truth):
+    """Return the share of the framed true length that no mask covers."""
+    start, end = truth.edges.T
+    length = np.linalg.norm(truth.position[start] - truth.position[end], axis=1)
+    framed = np.array(truth.extra.get("framed", np.ones(len(truth.position))), dtype=bool)[end]
+    masked = np.array(truth.extra["segmented"], dtype=bool)[end]
+    return float(length[framed & ~masked].sum() / length[framed].sum())
+
+
+def class_of(unmasked):
+    """Return the density class: up to .35 light, .4 to .6 medium, from .65 heavy; else the nearer.
+
+    The limits are halfway between these.
+    """
+    return CLASSES[int(unmasked > 0.375) + int(unmasked > 0.625)]
+
+
+def reliability_diagram(results, run_name):
+    """Return an SVG: share right over mean confidence, area of a dot by its vertices."""
+    marks = []
+    for part, colour in (("observed", "#0072b2"), ("predicted", "#d55e00")):
+        total = np.sum([r[run_name]["reliability"][part] for r in results.values()], axis=0)
+        for count, confidence, right in total[total[:, 0] > 0]:
+            x, y = 40 + 240 * confidence / count, 260 - 240 * right / count
+            radius = 2 + 10 * np.sqrt(count / total[:, 0].sum())
+            marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{colour}"/>')
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 300 300" font-size="11"'
+        ' font-family="sans-serif"><rect width="300" height="300" fill="#fff"/>'
+        '<path d="M40 20V260H280" fill="none" stroke="#000"/>'
+        '<path d="M40 260L280 20" stroke="#999" stroke-dasharray="4"/>'
+        '<text x="130" y="282">confidence</text><text x="22" y="264">0</text>'
+        '<text x="276" y="275">1</text><text x="28" y="26">1</text>'
+        '<text x="50" y="34" fill="#0072b2">observed</text>'
+        '<text x="50" y="48" fill="#d55e00">predicted</text>'
+        f'<text x="110" y="14">share right, {LABELS[run_name]}</text>' + "".join(marks) + "</svg>\n"
+    )
+
+
+def class_tables(results):
+    for name in CLASSES:
+        chosen = [r for r in results.values() if class_of(r["unmasked"]) == name]
+        yield f"## {name}: {len(chosen)} recordings"
+        yield ""
+        yield from header("method")
+        for run_name in RUNS:
+            yield row(LABELS[run_name], mean_figures(chosen, run_name))
+        yield ""
+
+
+def mean_figures(results, run_name):
+    means = {}
+    for figure in FIGURES:
+        values = [r[run_name][figure] for r in results if r[run_name][figure] is not None]
+        means[figure] = float(np.mean(values)) if values else None
+    return means
+
+
+def recording_table(results):
+    yield "## Each recording"
+    yield ""
+    yield from header("recording, method")
+    for stem, result in sorted(results.items()):
+        for run_name in RUNS:
+            yield row(f"{stem} ({result['unmasked']:.2f}), {LABELS[run_name]}", result[run_name])
+
+
+def header(first):
+    yield f"| {first} | " + " | ".join(FIGURES.values()) + " |"
+    yield "|---|" + "---|" * len(FIGURES)
+
+
+def row(label, figures):
+    cells = []
+    for name in FIGURES:
+        value = figures[name]
+        digits = {"components": 1, "view_ms": 0}.get(name, 3)
+        cells.append("–" if value is None else f"{value:.{digits}f}")
+    return f"| {label} | " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    main()

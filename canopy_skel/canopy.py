@@ -1,0 +1,243 @@
+"""Mode `canopy`: see more, join with calibrated confidence, reach behind the leaves.
+
+Everything a view adds is kept per view, and what all views say together is built from sums of
+integers and from arrays in the order of the views' numbers: no order of arrival can show.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from canopy_skel.confidence import Models
+from canopy_skel.ends import find_ends
+from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, count_evidence, counted
+from canopy_skel.extend import ExtensionConfig
+from canopy_skel.frame import Float32Array, View
+from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.likelihood import LikelihoodMap
+from canopy_skel.links import LinkConfig, Parts
+from canopy_skel.observe import Observation, observe
+from canopy_skel.pieces import PieceConfig
+from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
+from canopy_skel.segment import BranchMask
+from canopy_skel.wood import FragmentConfig
+
+POINT_FEATURES = 13
+NO_MAP_NATS = 12.0
+"""-log p where the likelihood map says nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CanopyConfig:
+    """Settings of the stages of mode `canopy`.
+
+    use_fragments: wood outside the masks counts. min_point, min_fragment_point: points of
+    instances, of fragments, less probable are dropped.
+    min_piece_m: observed parts with less wood, not joined to others, are dropped. rooted: join
+    what is left apart as well, with the low confidence it deserves, so that one tree results.
+    """
+
+    pieces: PieceConfig = field(default_factory=PieceConfig)
+    fragments: FragmentConfig = field(default_factory=FragmentConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    poses: PoseConfig = field(default_factory=PoseConfig)
+    links: LinkConfig = field(default_factory=LinkConfig)
+    extensions: ExtensionConfig = field(default_factory=ExtensionConfig)
+    use_fragments: bool = True
+    min_point: float = 0.5
+    min_fragment_point: float = 0.65
+    min_piece_m: float = 0.03
+    rooted: bool = False
+
+
+_STAGES: Mapping[str, type[Any]] = {
+    "pieces": PieceConfig,
+    "fragments": FragmentConfig,
+    "fusion": FusionConfig,
+    "poses": PoseConfig,
+    "links": LinkConfig,
+    "extensions": ExtensionConfig,
+}
+
+
+def canopy_config_from(fields: Mapping[str, Any]) -> CanopyConfig:
+    """Return the settings that `dataclasses.asdict` took apart.
+
+    Raises:
+        KeyError: a stage is missing.
+        TypeError: a field is missing or unknown.
+    """
+    stages = {name: stage(**fields[name]) for name, stage in _STAGES.items()}
+    return CanopyConfig(**{**fields, **stages})
+
+
+class CanopyScan:
+    """The views of one scan, in any order, and the skeleton of all so far."""
+
+    def __init__(self, config: CanopyConfig) -> None:
+        self.config = config
+        self._seen: dict[int, Observation] = {}
+        self._counts: dict[int, IntArray] = {}
+
+    def observe(
+        self, view: View, masks: Sequence[BranchMask], probability: Float32Array | None = None
+    ) -> Observation:
+        """Return what a view shows; nothing changes.
+
+        `probability` (H, W): of wood, where a detector gives it; without, colour has to do.
+        """
+        fragments = self.config.fragments if self.config.use_fragments else None
+        return observe(view, list(masks), self.config.pieces, fragments, probability)
+
+    def add(self, index: int, seen: Observation) -> None:
+        """Take a view in: all points are asked in it, and its points in all views."""
+        for other, points in self._seen.items():
+            self._counts[other] += counted(seen.evidence.classify(points.points_in_base))
+        self._seen[index] = seen
+        self._counts[index] = count_evidence(
+            seen.points_in_base, [one.evidence for one in self._seen.values()]
+        )
+
+    def remove(self, index: int) -> None:
+        """Take a view off again, with all it said of the points of others."""
+        gone = self._seen.pop(index, None)
+        if gone is None:
+            return
+        del self._counts[index]
+        for other, points in self._seen.items():
+            self._counts[other] -= counted(gone.evidence.classify(points.points_in_base))
+
+    def evidence(self, points_in_base: FloatArray) -> IntArray:
+        """Return how many views say what (N, 6) of points (N, 3)."""
+        return count_evidence(points_in_base, [one.evidence for one in self._seen.values()])
+
+    def points(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, IntArray, FloatArray]:
+        """Return all observed points: positions, directions, radii, fragment, view, features.
+
+        In the order of the views' numbers.
+        """
+        order = sorted(self._seen)
+        seen = [self._seen[i] for i in order]
+        features = [point_features(self._seen[i], self._counts[i]) for i in order]
+        view = [np.full(len(s.points_in_base), n, dtype=np.int64) for n, s in enumerate(seen)]
+        return (
+            np.concatenate([np.zeros((0, 3)), *(s.points_in_base for s in seen)]),
+            np.concatenate([np.zeros((0, 3)), *(s.directions for s in seen)]),
+            np.concatenate([np.zeros(0), *(s.radius_m for s in seen)]),
+            np.concatenate([np.zeros(0, dtype=np.bool_), *(s.fragment for s in seen)]),
+            np.concatenate([np.zeros(0, dtype=np.int64), *view]),
+            np.concatenate([np.zeros((0, POINT_FEATURES)), *features]),
+        )
+
+    def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
+        """Return the fused forest of what was seen, and which views were moved for it."""
+        points, directions, radius_m, fragment, view, features = self.points()
+        probability = np.where(
+            fragment, models.fragment_point(features), models.instance_point(features)
+        )
+        limit = np.where(fragment, self.config.min_fragment_point, self.config.min_point)
+        kept = probability >= limit
+        seen = Observations(
+            points_in_base=points[kept],
+            directions=directions[kept],
+            radius_m=radius_m[kept],
+            probability=probability[kept],
+            view=view[kept],
+            fragment=fragment[kept],
+        )
+        fused = fuse(seen, self.config.fusion)
+        corrections = pose_corrections(seen, fused, self.config.poses)
+        if corrections:
+            seen = replace(seen, points_in_base=corrected(seen, corrections))
+            fused = fuse(seen, self.config.fusion)
+        return fused, corrections
+
+    def parts(self, observed: Observed, models: Models) -> tuple[Parts, Observed]:
+        """Return what is to be joined, without specks, and the forest in the same numbers."""
+        component, length_m = component_lengths(observed)
+        stay = length_m >= self.config.min_piece_m
+        observed = chosen(observed, stay)
+        component, length_m = component_lengths(observed)
+        return (
+            Parts(
+                points=observed.vertices_in_base,
+                directions=observed.directions,
+                component=component,
+                length_m=length_m,
+                confidence=models.vertex(vertex_features(observed, length_m)),
+                radius_m=observed.support[:, 1],
+                fragment=observed.support[:, 5] < 0.5,
+                ends=find_ends(observed.vertices_in_base, observed.directions, observed.edges),
+            ),
+            observed,
+        )
+
+
+def map_cost(likelihood: LikelihoodMap, points_in_base: FloatArray) -> FloatArray:
+    """Return -log p_l (N,) of the likelihood map at points, capped where it says nothing."""
+    voxels = np.floor(points_in_base / likelihood.voxel_size_m).astype(np.int32)
+    probability = likelihood.probability_at(voxels)
+    return np.asarray(-np.log(np.maximum(probability, np.exp(-NO_MAP_NATS))))
+
+
+def point_features(seen: Observation, counts: IntArray) -> FloatArray:
+    """Return what speaks for each point being wood (N, 13)."""
+    empty = counts[:, THROUGH] + counts[:, BACKGROUND]
+    total = np.maximum(empty + counts[:, WOOD] + counts[:, LEAF], 1)
+    return np.column_stack(
+        [
+            seen.quality[:, :7],
+            np.minimum(empty, 3),
+            np.log1p(counts[:, WOOD]),
+            np.log1p(counts[:, LEAF]),
+            np.log1p(counts[:, HIDDEN]),
+            counts[:, WOOD] / total,
+            seen.quality[:, 7],
+        ]
+    )
+
+
+def vertex_features(observed: Observed, length_m: FloatArray) -> FloatArray:
+    """Return what speaks for each fused vertex (V, 7)."""
+    weight, radius_m, mean_p, largest_p, views, masks = observed.support.T
+    return np.column_stack(
+        [
+            np.log(np.maximum(views, 1)),
+            largest_p,
+            mean_p,
+            np.log(weight + 0.1),
+            np.log(np.maximum(radius_m, 1e-4)),
+            np.log(length_m + 0.01),
+            masks,
+        ]
+    )
+
+
+def component_lengths(observed: Observed) -> tuple[IntArray, FloatArray]:
+    """Return the component of each vertex (V,) and how much wood that component holds (V,)."""
+    n, edges = len(observed.vertices_in_base), observed.edges
+    adjacency = coo_array((np.ones(len(edges), np.int8), edges.T), shape=(n, n))
+    _, component = connected_components(adjacency, directed=False)
+    start, end = observed.vertices_in_base[edges.T]
+    of_edge = np.linalg.norm(end - start, axis=1)
+    total = np.bincount(
+        component[edges[:, 0]], weights=of_edge, minlength=component.max(initial=-1) + 1
+    )
+    return component.astype(np.int64), total[component]
+
+
+def chosen(observed: Observed, stay: BoolArray) -> Observed:
+    """Return the forest without the vertices that do not stay; whole components go."""
+    number = np.cumsum(stay) - 1
+    kept = stay[observed.edges].all(axis=1)
+    return Observed(
+        vertices_in_base=observed.vertices_in_base[stay],
+        directions=observed.directions[stay],
+        support=observed.support[stay],
+        edges=number[observed.edges[kept]],
+    )

@@ -1,0 +1,153 @@
+"""Points seen in many views -> one thin forest of observed wood (mode `canopy`)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.initial import prune_spurs
+from canopy_skel.kernels import fuse as kernel
+
+_BITS = 62
+"""Views are counted by bits of one number: of more than these some count as one."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FusionConfig:
+    """How points become curves.
+
+    `steps` of a mean shift across the local direction, against the points as observed: Gaussian
+    weights of max(`bandwidth_m`, `radius_share` x radius), neighbours within `max_angle_deg`,
+    fragments counting `fragment_weight`. Vertices are kept `spacing_m` apart, the best supported
+    first, and joined up to `reach_m`. Dead ends up to `spur_m` at a fork are noise.
+    """
+
+    steps: int = 3
+    bandwidth_m: float = 0.012
+    radius_share: float = 0.5
+    max_angle_deg: float = 45.0
+    fragment_weight: float = 0.5
+    seed_m: float = 0.004
+    spacing_m: float = 0.006
+    reach_m: float = 0.017
+    spur_m: float = 0.02
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Observations:
+    """Points on observed wood, in canonical order.
+
+    points_in_base, directions: (N, 3), unit. radius_m, probability (to be wood): (N,). view: (N,),
+    its place among those that are in. fragment: (N,), a fragment showed it and not an instance.
+    """
+
+    points_in_base: FloatArray
+    directions: FloatArray
+    radius_m: FloatArray
+    probability: FloatArray
+    view: IntArray
+    fragment: BoolArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Observed:
+    """The observed forest: vertices (V, 3), directions (V, 3), support (V, 6), edges (E, 2).
+
+    support: total weight, radius, mean and largest probability, views, share from instances.
+    """
+
+    vertices_in_base: FloatArray
+    directions: FloatArray
+    support: FloatArray
+    edges: IntArray
+
+
+def fuse(seen: Observations, config: FusionConfig) -> Observed:
+    """Draw the points onto curves, thin them and span them by a forest.
+
+    The points must come in canonical order; nothing else decides ties.
+    """
+    if len(seen.points_in_base) == 0:
+        return _NOTHING
+    cell_m = 2 * config.bandwidth_m
+    keys = kernel.cell_keys(seen.points_in_base, cell_m)
+    order = np.argsort(keys, kind="stable")
+    weight = seen.probability * np.where(seen.fragment, config.fragment_weight, 1.0)
+    seeds = _seeds(seen, weight, config.seed_m)
+    points, directions = seen.points_in_base[seeds], seen.directions[seeds]
+    radius_m, support = seen.radius_m[seeds], np.zeros((len(seeds), kernel.SUPPORT))
+    for _ in range(config.steps + 1):
+        points, directions, support = kernel.shift_across(
+            points,
+            directions,
+            radius_m,
+            seen.points_in_base[order],
+            seen.directions[order],
+            seen.radius_m[order],
+            weight[order],
+            seen.probability[order],
+            np.left_shift(1, seen.view[order] % _BITS),
+            seen.fragment[order],
+            keys[order],
+            cell_m,
+            config.bandwidth_m,
+            config.radius_share,
+            np.cos(np.radians(config.max_angle_deg)),
+        )
+        radius_m = support[:, 1]
+    kept = _thinned(points, support[:, 0], config.spacing_m)
+    points, directions, support = points[kept], directions[kept], support[kept]
+    edges = forest(points, directions, config.reach_m)
+    stay, edges = prune_spurs(points, edges, config.spur_m)
+    return Observed(
+        vertices_in_base=points[stay],
+        directions=directions[stay],
+        support=support[stay],
+        edges=edges,
+    )
+
+
+def forest(points: FloatArray, directions: FloatArray, reach_m: float) -> IntArray:
+    """Return the minimum spanning forest (E, 2) over pairs within reach, across directions dear."""
+    if len(points) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray").astype(np.int64)
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    cosine = np.abs(np.sum(directions[pairs[:, 0]] * directions[pairs[:, 1]], axis=1))
+    weights = np.maximum(length * (2.0 - cosine), 1e-12)
+    tree = minimum_spanning_tree(
+        coo_array((weights, pairs.T), shape=(len(points),) * 2).tocsr()
+    ).tocoo()
+    return np.stack([tree.row, tree.col], axis=1).astype(np.int64)
+
+
+def _seeds(seen: Observations, weight: FloatArray, seed_m: float) -> IntArray:
+    """Return the heaviest point of each cell that holds any, in the order of the points."""
+    of = kernel.cell_keys(seen.points_in_base, seed_m)
+    order = np.lexsort((np.arange(len(of)), -weight, of))
+    first = np.ones(len(of), dtype=np.bool_)
+    first[1:] = np.diff(of[order]) > 0
+    return np.sort(order[first])
+
+
+def _thinned(points: FloatArray, density: FloatArray, spacing_m: float) -> IntArray:
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.int64)
+    pairs = cKDTree(points).query_pairs(spacing_m, output_type="ndarray").astype(np.int64)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    start = np.append(0, np.cumsum(np.bincount(both[:, 0], minlength=len(points))))
+    order = np.lexsort((*points.T[::-1], -density))
+    return np.flatnonzero(kernel.thinned(order, start, np.ascontiguousarray(both[:, 1])))
+
+
+_NOTHING = Observed(
+    vertices_in_base=np.zeros((0, 3)),
+    directions=np.zeros((0, 3)),
+    support=np.zeros((0, kernel.SUPPORT)),
+    edges=np.zeros((0, 2), dtype=np.int64),
+)

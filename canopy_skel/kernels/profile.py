@@ -1,0 +1,201 @@
+"""Fit the centre line of a slender region in the picture and its disparity profile along it."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+MAX_KNOTS = 8
+QUALITY = 6
+"""Columns: pixels, length_px, width_px, valid share, inlier share, lateral deviation / width."""
+
+
+@njit(cache=True, nogil=True)
+def hats(x: float, count: int) -> tuple[int, float]:
+    """Return the knot left of x in [0, 1] and the weight of the one right of it."""
+    place = min(max(x, 0.0), 1.0) * (count - 1)
+    left = min(int(place), count - 2)
+    return left, place - left
+
+
+@njit(cache=True, nogil=True)
+def fit_hats(
+    x: Floats, y: Floats, weight: Floats, count: int, bend: float, prior: Floats, pull: float
+) -> Floats:
+    """Return the values (count,) at uniform knots of the weighted least-squares polyline.
+
+    `bend` weighs squared second differences, `pull` squared distances from `prior`; both times
+    the points per knot.
+    """
+    normal = np.zeros((count, count))
+    right = np.zeros(count)
+    for i in range(len(x)):
+        left, b = hats(x[i], count)
+        a, w = 1.0 - b, weight[i]
+        normal[left, left] += w * a * a
+        normal[left, left + 1] += w * a * b
+        normal[left + 1, left] += w * a * b
+        normal[left + 1, left + 1] += w * b * b
+        right[left] += w * a * y[i]
+        right[left + 1] += w * b * y[i]
+    share = len(x) / count
+    for k in range(count):
+        normal[k, k] += pull * share + 1e-9
+        right[k] += pull * share * prior[k] + 1e-9 * prior[k]
+    for k in range(1, count - 1):
+        for i, p in ((k - 1, 1.0), (k, -2.0), (k + 1, 1.0)):
+            for j, q in ((k - 1, 1.0), (k, -2.0), (k + 1, 1.0)):
+                normal[i, j] += bend * share * p * q
+    return np.linalg.solve(normal, right).astype(np.float64)
+
+
+@njit(cache=True, nogil=True)
+def best_line(
+    x: Floats, d: Floats, steepest: float, draws: int, tolerance_m: float
+) -> tuple[float, float]:
+    """Return disparity at x = 0 and its slope of the line through two points that fits best.
+
+    Misfits count up to the tolerance (truncated L1); a large region is judged by every n-th point.
+    """
+    n = len(x)
+    step = max(1, n // 256)
+    state = 12345
+    middle = float(np.median(d))
+    best_0, best_slope, best_misfit = middle, 0.0, np.inf
+    for draw in range(draws + 1):
+        at_0, slope = middle, 0.0
+        if draw > 0:
+            state = (state * 1103515245 + 12345) % 2147483648
+            i = (state >> 8) % n
+            state = (state * 1103515245 + 12345) % 2147483648
+            j = (state >> 8) % n
+            run = x[j] - x[i]
+            if abs(run) < 0.15:
+                continue
+            slope = (d[j] - d[i]) / run
+            if abs(slope) > steepest:
+                continue
+            at_0 = d[i] - slope * x[i]
+        misfit = 0.0
+        for k in range(0, n, step):
+            line = at_0 + slope * x[k]
+            tolerance = tolerance_m * max(line, 0.8) ** 2
+            misfit += min(abs(d[k] - line) / tolerance, 1.0)
+        if misfit < best_misfit:
+            best_0, best_slope, best_misfit = at_0, slope, misfit
+    return best_0, best_slope
+
+
+@njit(cache=True, nogil=True)
+def principal_axis(u: Floats, v: Floats) -> tuple[float, float, float, float]:
+    """Return the mean (2) and the unit axis (2) of largest spread; its larger part is positive."""
+    mu, mv = u.mean(), v.mean()
+    uu = ((u - mu) ** 2).mean()
+    vv = ((v - mv) ** 2).mean()
+    uv = ((u - mu) * (v - mv)).mean()
+    angle = 0.5 * math.atan2(2.0 * uv, uu - vv)
+    return mu, mv, math.cos(angle), math.sin(angle)
+
+
+@njit(cache=True, nogil=True)
+def fit_region(
+    u: Floats,
+    v: Floats,
+    z: Floats,
+    f_px: float,
+    knot_px: float,
+    max_knots: int,
+    tolerance_m: float,
+    min_valid: float,
+) -> tuple[int, Floats, Floats]:
+    """Fit one region of N pixels (u, v) with depth z (NaN where there is none).
+
+    Returns the number of knots (0: too little depth), rows (u, v, disparity) per knot, quality.
+    """
+    n = len(u)
+    knots = np.zeros((MAX_KNOTS, 3))
+    quality = np.zeros(QUALITY)
+    mu, mv, au, av = principal_axis(u, v)
+    s = (u - mu) * au + (v - mv) * av
+    q = (v - mv) * au - (u - mu) * av
+    low, high = s.min(), s.max()
+    span = max(high - low, 1.0)
+    count = min(max(int(span / knot_px + 0.5) + 1, 2), max_knots)
+    x = (s - low) / span
+    lateral = fit_hats(x, q, np.ones(n), count, 0.2, np.zeros(count), 0.002)
+    spread = 0.0
+    for i in range(n):
+        left, b = hats(x[i], count)
+        spread += (q[i] - (1.0 - b) * lateral[left] - b * lateral[left + 1]) ** 2
+    width = n / (span + 1.0)
+    good = np.isfinite(z)
+    valid = int(good.sum())
+    quality[0], quality[1], quality[2] = n, span + 1.0, width
+    quality[3], quality[5] = valid / n, math.sqrt(spread / n) / width
+    if valid < 3 or valid < min_valid * n:
+        return 0, knots, quality
+    xd, d = x[good], 1.0 / z[good]
+    steepest = 4.0 * float(np.median(d)) / f_px * span
+    at_0, slope = best_line(xd, d, steepest, 60, tolerance_m)
+    line = np.zeros(count)
+    for k in range(count):
+        line[k] = max(at_0 + slope * k / (count - 1), 1e-3)
+    values = line.copy()
+    weight = np.zeros(valid)
+    for _ in range(6):
+        for i in range(valid):
+            left, b = hats(xd[i], count)
+            fit = (1.0 - b) * values[left] + b * values[left + 1]
+            r = abs(d[i] - fit) / (tolerance_m * max(fit, 0.8) ** 2)
+            weight[i] = (1.0 - r * r) ** 2 if r < 1.0 else 0.0
+        values = fit_hats(xd, d, weight, count, 0.1, line, 0.01)
+    inliers, first, last = 0, 2.0, -1.0
+    for i in range(valid):
+        left, b = hats(xd[i], count)
+        fit = (1.0 - b) * values[left] + b * values[left + 1]
+        if abs(d[i] - fit) <= tolerance_m * max(fit, 0.8) ** 2:
+            inliers += 1
+            first, last = min(first, xd[i]), max(last, xd[i])
+    quality[4] = inliers / valid
+    if inliers < 3 or values.min() <= 0.05:
+        return 0, knots, quality
+    for k in range(count):
+        at = first + (last - first) * k / (count - 1)
+        left, b = hats(at, count)
+        here = low + at * span
+        side = (1.0 - b) * lateral[left] + b * lateral[left + 1]
+        knots[k, 0] = mu + here * au - side * av
+        knots[k, 1] = mv + here * av + side * au
+        knots[k, 2] = (1.0 - b) * values[left] + b * values[left + 1]
+    return count, knots, quality
+
+
+@njit(cache=True, nogil=True)
+def fit_regions(
+    u: Floats,
+    v: Floats,
+    z: Floats,
+    start: Ints,
+    f_px: float,
+    knot_px: float,
+    max_knots: int,
+    tolerance_m: float,
+    min_valid: float,
+) -> tuple[Ints, Floats, Floats]:
+    """Fit R regions; region i holds the pixels start[i] up to start[i + 1].
+
+    Returns knots per region (R,), rows (R, MAX_KNOTS, 3) of (u, v, disparity), quality (R, Q).
+    """
+    regions = len(start) - 1
+    counts = np.zeros(regions, dtype=np.int64)
+    knots = np.zeros((regions, MAX_KNOTS, 3))
+    quality = np.zeros((regions, QUALITY))
+    for i in range(regions):
+        a, b = start[i], start[i + 1]
+        counts[i], knots[i], quality[i] = fit_region(
+            u[a:b], v[a:b], z[a:b], f_px, knot_px, max_knots, tolerance_m, min_valid
+        )
+    return counts, knots, quality

@@ -1,0 +1,114 @@
+"""One view in mode `canopy`: points on the wood it shows, and what it says of other points."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from canopy_skel.evidence import ViewEvidence, evidence_of
+from canopy_skel.frame import Float32Array, View
+from canopy_skel.geometry import BoolArray, FloatArray
+from canopy_skel.pieces import Piece, PieceConfig, half_width_px, pieces_of, regions_of_masks
+from canopy_skel.segment import BranchMask
+from canopy_skel.spline import BranchSpline
+from canopy_skel.wood import (
+    FragmentConfig,
+    at_tree,
+    colour_wood_probability,
+    fragments_of,
+    mask_image,
+)
+
+SAMPLE_M = 0.005
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Observation:
+    """What one view shows.
+
+    splines: the pieces as polylines. dropped: instances without enough depth. points_in_base,
+    directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 8), score, quality
+    of the piece, log of half its area over its length. evidence: the view, ready to be asked.
+    """
+
+    splines: list[BranchSpline]
+    dropped: tuple[int, ...]
+    points_in_base: FloatArray
+    directions: FloatArray
+    radius_m: FloatArray
+    fragment: BoolArray
+    quality: FloatArray
+    evidence: ViewEvidence
+
+
+def observe(
+    view: View,
+    masks: list[BranchMask],
+    pieces_config: PieceConfig,
+    fragments_config: FragmentConfig | None,
+    probability: Float32Array | None = None,
+) -> Observation:
+    """Lift the masks of a view, and the fragments beside them, into base.
+
+    `probability` (H, W): of wood, from a detector; None: by colour. `fragments_config` None: no
+    fragments.
+
+    Raises:
+        ViewError: the view has no depth.
+    """
+    regions = regions_of_masks(masks)
+    pieces = pieces_of(view, regions, pieces_config, fragments=False)
+    lifted = {piece.spline.instance for piece in pieces}
+    wood = mask_image(view, regions)
+    if fragments_config is not None:
+        if probability is None:
+            probability = colour_wood_probability(view, wood, fragments_config)
+        else:
+            outside = at_tree(view, wood, fragments_config) & ~wood
+            probability = np.where(outside, probability, np.float32(0))
+        fragments = fragments_of(probability, fragments_config)
+        pieces += pieces_of(view, fragments, pieces_config, fragments=True)
+        wood[fragments.v, fragments.u] = True
+    points, directions, of = sampled(pieces)
+    return Observation(
+        splines=[piece.spline for piece in pieces],
+        dropped=tuple(mask.instance for mask in masks if mask.instance not in lifted),
+        points_in_base=points,
+        directions=directions,
+        radius_m=np.array([p.spline.radius_m for p in pieces])[of],
+        fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
+        quality=np.array([_quality(p) for p in pieces]).reshape(-1, 8)[of],
+        evidence=evidence_of(view, wood),
+    )
+
+
+def _quality(piece: Piece) -> list[float]:
+    pixels, length_px, width_px, valid, inlier, lateral = piece.quality.tolist()
+    return [
+        piece.spline.confidence,
+        float(np.log(pixels)),
+        float(np.log(length_px / width_px)),
+        float(np.log(width_px)),
+        valid,
+        inlier,
+        lateral,
+        float(np.log(piece.spline.radius_m * 0.5 * width_px / half_width_px(piece.quality))),
+    ]
+
+
+def sampled(pieces: list[Piece]) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Return points every `SAMPLE_M` along the pieces, unit directions, and the piece of each."""
+    points, directions, of = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for number, piece in enumerate(pieces):
+        knots = piece.spline.control_points_in_base
+        steps = np.diff(knots, axis=0)
+        length = np.linalg.norm(steps, axis=1)
+        way = np.append(0.0, np.cumsum(length))
+        if way[-1] < 1e-6:
+            continue
+        at = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / SAMPLE_M)) + 1))
+        which = np.clip(np.searchsorted(way, at, side="right") - 1, 0, len(length) - 1)
+        unit = steps / np.maximum(length, 1e-12)[:, None]
+        points.append(knots[which] + (at - way[which])[:, None] * unit[which])
+        directions.append(unit[which])
+        of.append(np.full(len(at), number))
+    return np.concatenate(points), np.concatenate(directions), np.concatenate(of)

@@ -1,0 +1,155 @@
+"""The front end of mode `canopy`: regions of a picture -> polylines with radius and quality.
+
+The centre line is fitted in the picture, where wood is sharp, and the depth along it as a robust
+profile of disparity, which is linear for a straight branch whatever its slope.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from canopy_skel.errors import ViewError
+from canopy_skel.frame import Float32Array, View
+from canopy_skel.geometry import FloatArray, IntArray, transform_points
+from canopy_skel.kernels import profile
+from canopy_skel.segment import BranchMask
+from canopy_skel.spline import BranchSpline
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PieceConfig:
+    """How a region becomes a polyline.
+
+    A knot every `knot_px` along it, at most 8 for an instance and `fragment_knots` for a fragment.
+    Depth counts within [nearest_m, farthest_m] and `tolerance_m` of the profile (growing with the
+    square of the distance beyond 1.25 m); a region with depth on less than `min_valid_share` of
+    its pixels is dropped. centre_shift: by how many radii the visible surface is moved away from
+    the camera.
+    """
+
+    knot_px: float = 12.0
+    fragment_knots: int = 3
+    nearest_m: float = 0.3
+    farthest_m: float = 5.0
+    tolerance_m: float = 0.012
+    min_valid_share: float = 0.15
+    centre_shift: float = np.pi / 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Regions:
+    """Pixel sets of one view: u, v (N,); region i holds pixels start[i] up to start[i + 1].
+
+    confidence: (R,), the segmenter's score or the mean wood probability. numbers: (R,) instance
+    numbers, 0 for fragments.
+    """
+
+    u: IntArray
+    v: IntArray
+    start: IntArray
+    confidence: FloatArray
+    numbers: IntArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Piece:
+    """One region lifted into base: its polyline, and what tells how far to believe it.
+
+    quality: (6,) pixels, length_px, width_px, share of pixels with depth, share of these on the
+    profile, lateral deviation over width.
+    """
+
+    spline: BranchSpline
+    fragment: bool
+    quality: FloatArray
+
+
+def regions_of_masks(masks: Sequence[BranchMask]) -> Regions:
+    """Return the pixels of the masks of one view."""
+    places = [np.nonzero(mask.mask) for mask in masks]
+    return Regions(
+        u=np.concatenate(
+            [np.zeros(0, np.int64)]
+            + [u + mask.left_px for (_, u), mask in zip(places, masks, strict=True)]
+        ),
+        v=np.concatenate(
+            [np.zeros(0, np.int64)]
+            + [v + mask.top_px for (v, _), mask in zip(places, masks, strict=True)]
+        ),
+        start=np.cumsum([0] + [len(v) for v, _ in places]),
+        confidence=np.array([mask.confidence for mask in masks], dtype=np.float64),
+        numbers=np.array([mask.instance for mask in masks], dtype=np.int64),
+    )
+
+
+def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: bool) -> list[Piece]:
+    """Lift the regions of a view into base, in their order, without those that lack depth.
+
+    Raises:
+        ViewError: the view has no depth.
+    """
+    depth_m = usable_depth(depth_of(view)[regions.v, regions.u], config).astype(np.float64)
+    camera = view.intrinsics
+    counts, knots, quality = profile.fit_regions(
+        regions.u.astype(np.float64),
+        regions.v.astype(np.float64),
+        depth_m,
+        regions.start.astype(np.int64),
+        camera.fx_px,
+        config.knot_px,
+        config.fragment_knots if fragments else profile.MAX_KNOTS,
+        config.tolerance_m,
+        config.min_valid_share,
+    )
+    pieces = []
+    for i in np.flatnonzero(counts).tolist():
+        u, v, disparity = knots[i, : counts[i]].T
+        points = camera.back_project(u, v, 1.0 / disparity)
+        radius_m = half_width_px(quality[i]) / camera.fx_px / float(disparity.mean())
+        points = points + config.centre_shift * radius_m * away_across(points)
+        spline = BranchSpline(
+            view_index=view.index,
+            instance=int(regions.numbers[i]),
+            confidence=float(regions.confidence[i]),
+            radius_m=radius_m,
+            control_points_in_base=transform_points(view.base_from_camera, points),
+        )
+        pieces.append(Piece(spline=spline, fragment=fragments, quality=quality[i]))
+    return pieces
+
+
+def half_width_px(quality: FloatArray) -> float:
+    """Return the half width of an even strip of pixels with this deviation from its middle.
+
+    Area over length would be too thin where leaves cut pieces out of the strip.
+    """
+    deviation_px = quality[5] * quality[2]
+    return float(np.sqrt(3.0 * (deviation_px**2 + 1.0 / 12.0)))
+
+
+def depth_of(view: View) -> Float32Array:
+    """Return the depth (H, W) of a view.
+
+    Raises:
+        ViewError: it has none.
+    """
+    if view.depth_m is None:
+        raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
+    return view.depth_m
+
+
+def usable_depth(depth_m: Float32Array, config: PieceConfig) -> Float32Array:
+    """Return the depth with NaN where it is out of range."""
+    inside = (depth_m >= config.nearest_m) & (depth_m <= config.farthest_m)
+    return np.where(inside, depth_m, np.float32(np.nan))
+
+
+def away_across(points: FloatArray) -> FloatArray:
+    """Return for knots (n, 3) in the camera frame the unit way from the camera across the line."""
+    along = np.gradient(points, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    across = ray - np.sum(ray * along, axis=1, keepdims=True) * along
+    norm = np.linalg.norm(across, axis=1, keepdims=True)
+    return np.where(norm > 0.05, across / np.maximum(norm, 0.05), 0.0)

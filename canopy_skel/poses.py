@@ -1,0 +1,125 @@
+"""Where a view disagrees with all views together, its pose is off: measure it, and mend it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from canopy_skel.fusion import Observations, Observed
+from canopy_skel.geometry import FloatArray, IntArray, transform_from, transform_points
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PoseConfig:
+    """When a view is moved onto the fused skeleton.
+
+    Points within `reach_m` of it and along it count, at least `min_points`. A view is moved only
+    if they lie `worst_m` off (median, across the wood) or more, and the move takes that to at most
+    `enough` of it: a good rig is left alone.
+    """
+
+    reach_m: float = 0.03
+    min_points: int = 100
+    worst_m: float = 0.0015
+    enough: float = 0.7
+    rounds: int = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class PoseCorrection:
+    """A view that was moved: its place among those that are in, and by what.
+
+    moved: (4, 4), maps points of the view as reported to where they belong, in base. before_m,
+    after_m: median distance of its wood from the fused skeleton, across it.
+    """
+
+    view: int
+    moved: FloatArray
+    before_m: float
+    after_m: float
+
+
+def pose_corrections(
+    seen: Observations, fused: Observed, config: PoseConfig
+) -> list[PoseCorrection]:
+    """Return how the views that disagree with the fused skeleton have to be moved.
+
+    What is common to all views, such as a wrong hand-eye calibration, cannot be seen here.
+    """
+    if len(fused.vertices_in_base) == 0:
+        return []
+    tree = cKDTree(fused.vertices_in_base)
+    found = []
+    for view in np.unique(seen.view).tolist():
+        chosen = np.flatnonzero((seen.view == view) & ~seen.fragment)
+        if len(chosen) < config.min_points:
+            continue
+        points, directions = seen.points_in_base[chosen], seen.directions[chosen]
+        moved, before_m, after_m = _aligned(points, directions, fused, tree, config)
+        if before_m >= config.worst_m and after_m <= config.enough * before_m:
+            found.append(PoseCorrection(view=view, moved=moved, before_m=before_m, after_m=after_m))
+    return found
+
+
+def corrected(seen: Observations, corrections: list[PoseCorrection]) -> FloatArray:
+    """Return the positions (N, 3) of the points with the views moved."""
+    points = seen.points_in_base.copy()
+    for one in corrections:
+        chosen = seen.view == one.view
+        points[chosen] = transform_points(one.moved, points[chosen])
+    return points
+
+
+def _aligned(
+    points: FloatArray, directions: FloatArray, fused: Observed, tree: cKDTree, config: PoseConfig
+) -> tuple[FloatArray, float, float]:
+    """Return the transform and the median distance across the wood before and after it."""
+    moved, here = np.eye(4), points
+    before_m = after_m = 0.0
+    for step in range(config.rounds + 1):
+        near, index = _matches(here, directions, fused, tree, config)
+        if len(near) < config.min_points:
+            return np.eye(4), before_m, np.inf
+        off = _across(fused.vertices_in_base[index] - here[near], fused.directions[index])
+        after_m = float(np.median(np.linalg.norm(off, axis=1)))
+        before_m = after_m if step == 0 else before_m
+        if step < config.rounds:
+            moved = _small_move(here[near], off, fused.directions[index]) @ moved
+            here = transform_points(moved, points)
+    return moved, before_m, after_m
+
+
+def _matches(
+    points: FloatArray, directions: FloatArray, fused: Observed, tree: cKDTree, config: PoseConfig
+) -> tuple[IntArray, IntArray]:
+    distance, index = tree.query(points, distance_upper_bound=config.reach_m)
+    near = np.flatnonzero(np.isfinite(distance))
+    index = index[near].astype(np.int64)
+    along = np.abs(np.sum(directions[near] * fused.directions[index], axis=1)) > 0.9
+    return near[along].astype(np.int64), index[along]
+
+
+def _across(vectors: FloatArray, directions: FloatArray) -> FloatArray:
+    along = np.sum(vectors * directions, axis=1, keepdims=True)
+    return np.asarray(vectors - along * directions)
+
+
+def _small_move(points: FloatArray, off: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return the rigid motion that takes most of `off` away: one robust Gauss-Newton step."""
+    centre = points.mean(axis=0)
+    arm = points - centre
+    # d(point) = shift + turn x arm, seen across the wood only.
+    jacobian = np.zeros((len(points), 3, 6))
+    jacobian[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+    for column in range(6):
+        jacobian[:, :, column] = _across(jacobian[:, :, column], directions)
+    size = np.linalg.norm(off, axis=1)
+    weight = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-6))
+    normal = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
+    right = np.einsum("nij,n,ni->j", jacobian, weight, off)
+    step = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(6), right)
+    rotation = Rotation.from_rotvec(step[3:]).as_matrix()
+    return transform_from(rotation, centre + step[:3] - rotation @ centre)

@@ -1,0 +1,307 @@
+import json
+from dataclasses import asdict, replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scenes.leaves import GAP, leafy_view
+from scenes.wood import WOOD, view_from
+
+from canopy_skel.canopy import CanopyConfig, canopy_config_from
+from canopy_skel.confidence import (
+    Logistic,
+    fit_logistic,
+    models_from,
+    models_to,
+    shipped_models,
+)
+from canopy_skel.document import Method, build_document, from_json, to_json
+from canopy_skel.ends import find_ends
+from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
+from canopy_skel.evidence import WOOD as WOOD_SEEN
+from canopy_skel.links import Candidates, accepted
+from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
+from canopy_skel.pipeline import MethodConfig, Skeletonizer
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+from canopy_skel.wood import FragmentConfig, WoodDetector, colour_wood_probability, fragments_of
+
+PLAIN = view_from(0)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [leafy_view(0), leafy_view(1, y=0.1), leafy_view(2, z=0.1)]
+
+
+@pytest.fixture(scope="module")
+def clear_views():
+    return [PLAIN, view_from(1, y=0.1), view_from(2, z=0.1)]
+
+
+def maker_of(views, **settings_):
+    config = MethodConfig(name="canopy", canopy=CanopyConfig(**settings_))
+    maker = Skeletonizer(RecordedSegmenter(), config)
+    for view in views:
+        maker.add_view(view)
+    return maker
+
+
+def document_of(maker):
+    used = len(maker.views)
+    return build_document(
+        maker.skeleton().graph,
+        scan_id="s",
+        revision=used,
+        method=Method(name="canopy"),
+        views_used=used,
+    )
+
+
+def off_wood(points):
+    off = []
+    for start, end, _ in WOOD:
+        start, way = np.array(start), np.array(end) - np.array(start)
+        along = np.clip((points - start) @ way / (way @ way), 0, 1)
+        off.append(np.linalg.norm(points - start - along[:, None] * way, axis=1))
+    return np.min(off, axis=0)
+
+
+def test_the_skeleton_lies_in_the_wood_and_a_link_bridges_what_leaves_hide(views):
+    document = document_of(maker_of(views))
+    source = np.array(document.extra["source"])
+    assert off_wood(document.position)[source == "observed"].max() < 0.006
+    linked = document.position[source == "link"]
+    assert np.linalg.norm(linked - GAP, axis=1).min() < 0.01
+    np.testing.assert_array_equal(document.occluded, np.isin(source, ["link", "extension"]))
+    assert (document.confidence[~document.occluded] > 0.5).all()
+
+
+def test_nothing_is_predicted_where_the_sky_shows_through(clear_views):
+    document = document_of(maker_of(clear_views))
+    ahead = document.position[document.occluded]
+    assert (np.linalg.norm(ahead - GAP, axis=1) > 0.02).all()
+    assert off_wood(ahead).max(initial=0.0) < 0.02
+
+
+def test_radii_are_those_of_the_sticks(views):
+    document = document_of(maker_of(views))
+    trunk = ~document.occluded & (np.abs(document.position[:, 1]) < 0.005)
+    assert np.median(document.radius[trunk]) == pytest.approx(0.015, rel=0.15)
+
+
+def test_the_order_of_views_and_asking_in_between_do_not_matter_to_the_byte(views):
+    expected = to_json(document_of(maker_of(views)))
+    for order in permutations(views):
+        maker = maker_of([])
+        for view in order:
+            maker.add_view(view)
+            maker.skeleton()
+            maker.add_view(view)
+        assert to_json(document_of(maker)) == expected
+
+
+def test_a_view_taken_off_leaves_no_trace(views):
+    maker = maker_of(views)
+    maker.remove_view(1)
+    assert to_json(document_of(maker)) == to_json(document_of(maker_of([views[0], views[2]])))
+
+
+def test_rooted_gives_one_tree_whose_extra_joins_nobody_will_believe(clear_views):
+    apart, rooted = (document_of(maker_of(clear_views, rooted=r)) for r in (False, True))
+    assert apart.components > 1
+    assert rooted.components == 1
+    assert rooted.confidence[rooted.occluded].min() <= 0.1
+    assert len(rooted.edges) == len(rooted.position) - 1
+
+
+def test_a_view_whose_pose_is_off_is_moved_back_and_the_others_are_not():
+    good = [
+        view_from(i, y=y, z=z)
+        for i, (y, z) in enumerate([(0, 0), (0.08, 0), (-0.08, 0.05), (0, 0.1)])
+    ]
+    last = view_from(4, y=0.04)
+    pose = last.base_from_camera.copy()
+    pose[1, 3] += 0.007
+    extraction = maker_of([*good, replace(last, base_from_camera=pose)]).skeleton()
+    (correction,) = extraction.corrections
+    assert correction.view == 4
+    assert correction.after_m < 0.5 * correction.before_m
+    assert correction.moved[1, 3] + correction.moved[1, :3] @ [1, 0, 0] == pytest.approx(
+        -0.007, abs=0.003
+    )
+    assert maker_of([*good, last]).skeleton().corrections == ()
+
+
+def test_documents_keep_how_each_vertex_is_known(views):
+    document = document_of(maker_of(views))
+    assert from_json(to_json(document)).extra["source"] == document.extra["source"]
+
+
+def test_views_without_wood_give_an_empty_skeleton():
+    maker = maker_of([replace(PLAIN, instances=np.zeros((240, 320), np.uint16))])
+    extraction = maker.skeleton()
+    assert len(extraction.graph.vertices_in_base) == 0
+    assert extraction.voxels == 0
+
+
+def test_other_methods_do_not_notice_the_settings_of_canopy():
+    assert MethodConfig(canopy=CanopyConfig(rooted=True)).sha256() == MethodConfig().sha256()
+    rooted = MethodConfig(name="canopy", canopy=CanopyConfig(rooted=True))
+    assert rooted.sha256() != MethodConfig(name="canopy").sha256()
+
+
+def test_settings_survive_being_taken_apart():
+    config = CanopyConfig(rooted=True, fragments=FragmentConfig(min_px=12))
+    assert canopy_config_from(asdict(config)) == config
+
+
+def test_pieces_run_along_the_axes_of_the_sticks():
+    view = PLAIN
+    regions = regions_of_masks(RecordedSegmenter().segment(view))
+    pieces = pieces_of(view, regions, PieceConfig(), fragments=False)
+    assert len(pieces) == 3
+    for piece, (start, end, radius) in zip(pieces, WOOD, strict=True):
+        knots = piece.spline.control_points_in_base
+        assert off_wood(knots).max() < 0.005
+        length = np.linalg.norm(knots[-1] - knots[0])
+        assert length == pytest.approx(np.linalg.norm(np.subtract(end, start)), abs=0.012)
+        assert piece.spline.radius_m == pytest.approx(radius, rel=0.25)
+
+
+def test_leaves_that_cover_some_pixels_do_not_move_a_piece():
+    view = PLAIN
+    depth_m = view.depth_m.copy()
+    rows, columns = np.nonzero(view.instances == 1)
+    hit = np.random.default_rng(1).random(len(rows)) < 0.4
+    depth_m[rows[hit], columns[hit]] = 0.8
+    spoilt = replace(PLAIN, depth_m=depth_m)
+    regions = regions_of_masks(RecordedSegmenter().segment(spoilt))
+    trunk = pieces_of(spoilt, regions, PieceConfig(), fragments=False)[0]
+    assert off_wood(trunk.spline.control_points_in_base).max() < 0.006
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    stick=st.integers(0, 2),
+    along=st.floats(0.05, 0.95),
+    fraction=st.floats(0.3, 0.9),
+    beyond=st.floats(0.1, 0.5),
+)
+def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
+    stick, along, fraction, beyond
+):
+    evidence = evidence_of(PLAIN, PLAIN.instances > 0)
+    start, end, _ = WOOD[stick]
+    wood = np.array(start) + along * np.subtract(end, start)
+    counts = count_evidence(
+        np.array([wood, wood * fraction, wood * (1 + beyond)]), [evidence, evidence]
+    )
+    assert not is_empty(counts)[0]
+    assert counts[0, WOOD_SEEN] == 2
+    assert counts[1, WOOD_SEEN] == 0
+    assert counts[2, HIDDEN] == 2
+
+
+def test_colour_tells_unmasked_wood_from_leaves():
+    view = PLAIN
+    color = np.zeros((240, 320, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(-8, 9, color.shape)
+    color[:] = np.clip(np.array([60, 120, 40]) + noise, 0, 255)
+    wood = view.instances > 0
+    color[wood] = np.clip(np.array([110, 90, 80]) + noise[wood], 0, 255)
+    depth_m = np.where(np.isnan(view.depth_m), np.float32(1.05), view.depth_m)
+    masked = wood & (view.instances != 3)
+    coloured = replace(PLAIN, color_rgb=color, depth_m=depth_m)
+    probability = colour_wood_probability(coloured, masked, FragmentConfig())
+    found = fragments_of(probability, FragmentConfig())
+    shown = np.zeros(wood.shape, bool)
+    shown[found.v, found.u] = True
+    assert shown[view.instances == 3].mean() > 0.8
+    assert shown[~wood].mean() < 0.01
+    assert not shown[masked].any()
+
+
+def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():
+    class Detector(RecordedSegmenter):
+        def wood_probability(self, view):
+            return np.where(PLAIN.instances == 3, np.float32(0.95), np.float32(0.05))
+
+    view = PLAIN
+    masks = np.where(view.instances == 3, 0, view.instances).astype(np.uint16)
+    maker = Skeletonizer(Detector(), MethodConfig(name="canopy"))
+    assert isinstance(Detector(), WoodDetector)
+    assert maker.add_view(replace(PLAIN, instances=masks)) == 3
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    points=arrays(np.float64, (12, 3), elements=st.floats(-1, 1, width=32), unique=True),
+    parents=st.lists(st.integers(0, 11), min_size=12, max_size=12),
+)
+def test_every_forest_has_an_end_per_tip_and_two_per_lone_vertex(points, parents):
+    edges = np.array([(p % v, v) for v, p in enumerate(parents) if v and p < 9]).reshape(-1, 2)
+    degree = np.bincount(edges.ravel(), minlength=12)
+    ends = find_ends(points, np.tile([1.0, 0, 0], (12, 1)), edges.astype(np.int64))
+    assert np.bincount(ends.vertex, minlength=12).tolist() == [
+        {0: 2, 1: 1}.get(d, 0) for d in degree.tolist()
+    ]
+    np.testing.assert_allclose(np.linalg.norm(ends.tangents, axis=1), 1.0)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    links=st.lists(
+        st.tuples(st.integers(0, 9), st.integers(0, 9), st.booleans(), st.floats(0.01, 0.99)),
+        max_size=40,
+    ),
+    threshold=st.floats(0.1, 0.9),
+)
+def test_links_make_a_forest_use_each_end_once_and_take_the_best(links, threshold):
+    links = [link for link in links if link[0] != link[1]]
+    end = np.array([a for a, *_ in links], dtype=np.int64)
+    vertex = np.array([b for _, b, *_ in links], dtype=np.int64)
+    other = np.where([at_end for *_, at_end, _ in links], vertex, -1).astype(np.int64)
+    probability = np.array([p for *_, p in links])
+    candidates = Candidates(
+        end=end,
+        vertex=vertex,
+        other=other,
+        curves=np.zeros((len(links), 17, 3)),
+        features=np.zeros((len(links), 20)),
+    )
+    component = np.arange(10)
+    made = accepted(candidates, probability, component, component, threshold)
+    used = [*end[made].tolist(), *other[made][other[made] >= 0].tolist()]
+    assert len(used) == len(set(used))
+    assert (probability[made] >= threshold).all()
+    root = list(range(10))
+    for i in made.tolist():
+        a, b = root[end[i]], root[vertex[i]]
+        assert a != b
+        root = [a if r == b else r for r in root]
+    if len(links) and probability.max() >= threshold:
+        assert probability[made].max() == probability.max()
+
+
+def test_a_fitted_logistic_means_what_it_says():
+    rng = np.random.default_rng(3)
+    features = rng.normal(2.0, 3.0, (20000, 2))
+    true_p = 1 / (1 + np.exp(-(0.5 + features @ [0.4, -0.2])))
+    model = fit_logistic(features, rng.random(20000) < true_p)
+    assert np.abs(model(features) - true_p).max() < 0.03
+
+
+def test_a_row_has_the_same_probability_alone_and_among_others():
+    model = Logistic(bias=0.1, weights=(0.3, 0.7), means=(0.0, 1.0), scales=(1.0, 2.0))
+    features = np.random.default_rng(0).normal(size=(100, 2))
+    alone = [model(row[None])[0] for row in features]
+    assert model(features).tolist() == alone
+
+
+def test_models_survive_being_written():
+    models = shipped_models()
+    assert models_from(json.loads(models_to(models))) == models
+    assert models.provenance
