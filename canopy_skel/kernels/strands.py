@@ -1,6 +1,8 @@
-"""From maps of direction and radius to strands: linked cells, cut where they bend, grown out.
+"""From maps of middle line, direction and radius to strands: thinned, chained, cut, grown out.
 
-Cells are those of the network's output grid; lengths and radii here are in cells.
+Cells are those of the network's output grid; lengths and radii here are in cells, u to the right
+and v down. A cell of a middle line links to at most one cell ahead and one behind, so that a fork never
+makes one strand of two branches.
 """
 
 import numpy as np
@@ -12,6 +14,9 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+
+ACROSS = 0.35
+"""How far aside a link may jump, in radii; the half width of a middle line's band."""
 
 
 @njit(cache=True, nogil=True)
@@ -36,157 +41,263 @@ def smoothed(inside: Bool, maps: F32, out: F32) -> None:
 
 
 @njit(cache=True)
-def _root(parent: I32, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
+def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
+    """Say whether a cell may go in this half of a round of Zhang and Suen (1984)."""
+    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
+    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
+    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
+    count = int(p2) + p3 + p4 + p5 + p6 + p7 + p8 + p9
+    if count < 2 or count > 6:
+        return False
+    turns = int(not p2 and p3) + int(not p3 and p4) + int(not p4 and p5) + int(not p5 and p6)
+    turns += int(not p6 and p7) + int(not p7 and p8) + int(not p8 and p9) + int(not p9 and p2)
+    if turns != 1:
+        return False
+    if second:
+        return not (p2 and p4 and p8) and not (p2 and p6 and p8)
+    return not (p2 and p4 and p6) and not (p4 and p6 and p8)
+
+
+@njit(cache=True)
+def _is_corner(core: Bool, i: int, j: int) -> bool:
+    """Say whether a line runs on without a cell of it, diagonally (Yokoi's number is 1)."""
+    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
+    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
+    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
+    parts = int(not p2 and (p3 or p4)) + int(not p4 and (p5 or p6))
+    parts += int(not p6 and (p7 or p8)) + int(not p8 and (p9 or p2))
+    return parts == 1 and int(p2) + p3 + p4 + p5 + p6 + p7 + p8 + p9 >= 2
 
 
 @njit(cache=True, nogil=True)
-def linked(inside: Bool, maps: F32, least_cosine: float, most_ratio: float, out: I32) -> int:
-    """Number the regions of inside cells linked to neighbours of like direction and radius.
+def thinned(core: Bool) -> I32:
+    """Thin a core (h, w) to lines one cell wide, in place; return (N, 2) row and column of them.
 
-    maps: (3, h, w) cosine and sine of twice the angle, log radius. least_cosine: of twice the
-    angle between neighbours. most_ratio: of radii, logarithmic. out: (h, w), 0 = none, else 1, 2 …
+    Its outermost cells must be False.
     """
-    height, width = inside.shape
-    parent = np.arange(height * width).astype(np.int32)
-    for i in range(height):
-        for j in range(width):
-            if not inside[i, j]:
-                continue
-            c, s = maps[0, i, j], maps[1, i, j]
-            norm = np.sqrt(c * c + s * s) + 1e-9
-            for a, b in ((i, j - 1), (i - 1, j - 1), (i - 1, j), (i - 1, j + 1)):
-                if a < 0 or b < 0 or b >= width or not inside[a, b]:
-                    continue
-                x, y = maps[0, a, b], maps[1, a, b]
-                if c * x + s * y < least_cosine * norm * (np.sqrt(x * x + y * y) + 1e-9):
-                    continue
-                if abs(maps[2, i, j] - maps[2, a, b]) > most_ratio:
-                    continue
-                p, q = _root(parent, i * width + j), _root(parent, a * width + b)
-                parent[max(p, q)] = min(p, q)
+    height, width = core.shape
+    live = np.empty((core.size, 2), dtype=np.int32)
     count = 0
-    for i in range(height):
-        for j in range(width):
-            out[i, j] = 0
-            if inside[i, j]:
-                here = i * width + j
-                top = _root(parent, here)
-                if top == here:
-                    count += 1
-                    out[i, j] = count
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if core[i, j]:
+                live[count, 0], live[count, 1] = i, j
+                count += 1
+    marked = np.zeros(count, dtype=np.bool_)
+    changed = True
+    while changed:
+        changed = False
+        for second in (False, True):
+            for k in range(count):
+                marked[k] = _removable(core, live[k, 0], live[k, 1], second)
+            kept = 0
+            for k in range(count):
+                i, j = live[k, 0], live[k, 1]
+                if marked[k]:
+                    core[i, j] = False
+                    changed = True
                 else:
-                    out[i, j] = out[top // width, top % width]
-    return count
+                    live[kept, 0], live[kept, 1] = i, j
+                    kept += 1
+            count = kept
+    kept = 0
+    for k in range(count):
+        i, j = live[k, 0], live[k, 1]
+        if _is_corner(core, i, j):
+            core[i, j] = False
+        else:
+            live[kept, 0], live[kept, 1] = i, j
+            kept += 1
+    return live[:kept].copy()
 
 
 @njit(cache=True)
-def _axis(rows: I32, columns: I32) -> tuple[float, float, float, float]:
-    """Return the centroid (u, v) and the unit principal axis of cells."""
-    n = len(rows)
-    u, v = 0.0, 0.0
-    for k in range(n):
-        u += columns[k]
-        v += rows[k]
-    u, v = u / n, v / n
-    uu, uv, vv = 0.0, 0.0, 0.0
-    for k in range(n):
-        a, b = columns[k] - u, rows[k] - v
-        uu += a * a
-        uv += a * b
-        vv += b * b
-    angle = 0.5 * np.arctan2(2 * uv, uu - vv)
-    return u, v, np.cos(angle), np.sin(angle)
+def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
+    """Return what it costs to go from cell a to b, inf if it is out of the question.
 
-
-@njit(cache=True)
-def _cut(rows: I32, columns: I32, radius: float, rule: F64, along: F64) -> float:
-    """Return where along its axis a strand bends, inf if nowhere; fill `along` (N,).
-
-    rule: least offset, share of the length, share of the radius, least length to look at.
+    The sign says whether b lies ahead of a. gate: least cosine of twice the angle between them,
+    largest logarithmic ratio of their radii.
     """
-    u, v, c, s = _axis(rows, columns)
-    low, high = np.inf, -np.inf
-    for k in range(len(rows)):
-        along[k] = c * (columns[k] - u) + s * (rows[k] - v)
-        low, high = min(low, along[k]), max(high, along[k])
-    length = high - low + 1.0
-    if length < rule[3]:
+    x, y, log_radius = maps[0, a[0], a[1]], maps[1, a[0], a[1]], maps[2, a[0], a[1]]
+    v, w = maps[0, b[0], b[1]], maps[1, b[0], b[1]]
+    angle = 0.5 * np.arctan2(y, x)
+    c, s = np.cos(angle), np.sin(angle)
+    du, dv = b[1] - a[1], b[0] - a[0]
+    along, across = c * du + s * dv, abs(c * dv - s * du)
+    aside = max(ACROSS * np.exp(log_radius), 1.0)
+    spread = 1.0 if abs(du) <= 1 and abs(dv) <= 1 else 0.5
+    if abs(along) < 0.3 or abs(along) > window or across > min(aside, 0.3 + spread * abs(along)):
         return np.inf
-    bins = int(min(max(length / 4.0, 3.0), 16.0))
-    weight, offset = np.zeros(bins), np.zeros(bins)
-    for k in range(len(rows)):
-        place = min(int((along[k] - low) / length * bins), bins - 1)
-        weight[place] += 1.0
-        offset[place] += c * (rows[k] - v) - s * (columns[k] - u)
-    first, last = offset[0] / max(weight[0], 1.0), offset[bins - 1] / max(weight[bins - 1], 1.0)
-    worst, where = max(rule[0], rule[1] * length, rule[2] * radius), np.inf
-    for place in range(1, bins - 1):
-        if weight[place] > 0:
-            chord = first + (last - first) * place / (bins - 1)
-            away = abs(offset[place] / weight[place] - chord)
-            if away > worst:
-                worst, where = away, low + (place + 0.5) / bins * length
+    cosine = (x * v + y * w) / (np.sqrt((x * x + y * y) * (v * v + w * w)) + 1e-9)
+    if cosine < gate[0] or abs(maps[2, b[0], b[1]] - log_radius) > gate[1]:
+        return np.inf
+    price = abs(along) + 2.0 * across + 4.0 * (1.0 - cosine)
+    return price if along > 0 else -price
+
+
+@njit(cache=True)
+def _window(log_radius: float, tries: int) -> int:
+    """Return how far to look for the next cell; farther with each try."""
+    return int(min(max(1.0 + 1.5 * ACROSS * np.exp(log_radius), 2.0) + tries, 9.0))
+
+
+@njit(cache=True, nogil=True)
+def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
+    """Return (N, 2) the cell that each is linked with behind and ahead, -1 = none.
+
+    number: (h, w) the place in `cells`, -1 = none; cells: (N, 2) row and column. gate: see `_price`. A link is
+    made where it is the best for both of its cells among those still free on that side; then
+    those left over try again.
+    """
+    height, width = number.shape
+    link = np.full((len(cells), 2), -1, dtype=np.int32)
+    best = np.empty((len(cells), 2), dtype=np.int32)
+    for attempt in range(tries):
+        best[:] = -1
+        for k in range(len(cells)):
+            i, j = cells[k]
+            if link[k, 0] >= 0 and link[k, 1] >= 0:
+                continue
+            window = _window(maps[2, i, j], attempt)
+            cost = np.full(2, np.inf)
+            for a in range(max(i - window, 0), min(i + window + 1, height)):
+                for b in range(max(j - window, 0), min(j + window + 1, width)):
+                    n = number[a, b]
+                    if n < 0 or n == k or n == link[k, 0] or n == link[k, 1]:
+                        continue
+                    price = _price(maps, cells[k], cells[n], window, gate)
+                    side = 1 if price > 0 else 0
+                    if abs(price) >= cost[side] or link[k, side] >= 0:
+                        continue
+                    back = 1 if _price(maps, cells[n], cells[k], 99.0, gate) > 0 else 0
+                    if link[n, back] < 0:
+                        cost[side], best[k, side] = abs(price), n
+        for k in range(len(cells)):
+            for side in range(2):
+                n = best[k, side]
+                if n < 0:
+                    continue
+                for back in range(2):
+                    if best[n, back] == k and link[n, back] < 0 and link[k, side] < 0:
+                        link[k, side], link[n, back] = n, k
+    return link
+
+
+@njit(cache=True, nogil=True)
+def chains(link: I32) -> tuple[I32, I64]:
+    """Return the cells in the order of their chains, and where each chain starts and ends.
+
+    A chain is a path; a ring is opened at its first cell.
+    """
+    count = len(link)
+    order, starts = np.empty(count, dtype=np.int32), [np.int64(0)]
+    seen = np.zeros(count, dtype=np.bool_)
+    filled = 0
+    for rings in (False, True):
+        for first in range(count):
+            degree = (link[first, 0] >= 0) + (link[first, 1] >= 0)
+            if seen[first] or (degree == 2 and not rings):
+                continue
+            here = first
+            while here >= 0:
+                seen[here] = True
+                order[filled] = here
+                filled += 1
+                a, b = link[here, 0], link[here, 1]
+                if a >= 0 and not seen[a]:
+                    here = a
+                elif b >= 0 and not seen[b]:
+                    here = b
+                else:
+                    here = -1
+            starts.append(filled)
+    return order, np.array(starts)
+
+
+@njit(cache=True)
+def _bend(path: I32, radius: float, rule: F64) -> int:
+    """Return which cell of a path lies farthest off its chord if that is a bend, else -1.
+
+    rule: least offset, share of the length, share of the radius.
+    """
+    last = len(path) - 1
+    if last < 4:
+        return -1
+    du, dv = path[last, 1] - path[0, 1], path[last, 0] - path[0, 0]
+    length = np.sqrt(du * du + dv * dv) + 1e-9
+    worst, where = max(rule[0], rule[1] * length, rule[2] * radius), -1
+    for k in range(2, last - 1):
+        away = abs((path[k, 1] - path[0, 1]) * dv - (path[k, 0] - path[0, 0]) * du) / length
+        if away > worst:
+            worst, where = away, k
     return where
 
 
 @njit(cache=True, nogil=True)
-def straightened(label: I32, count: int, log_radius: F32, least_cells: int, rule: F64) -> int:
-    """Cut the regions of `label` where they bend, in place; return how many there are now.
+def straight_pieces(
+    cells: I32, starts: I64, log_radius: F32, rule: F64, least_cells: float
+) -> I64:
+    """Cut chains where they bend; return (M, 2) begin and end of the pieces long enough.
 
-    Regions of fewer than `least_cells` become 0. rule: see `_cut`.
+    cells: (N, 2) in the order of their chains. rule: see `_bend`.
     """
-    height, width = label.shape
-    sizes = np.zeros(count + 2, dtype=np.int64)
-    for i in range(height):
-        for j in range(width):
-            sizes[label[i, j] + 1] += 1
-    starts = np.cumsum(sizes)
-    rows = np.empty(height * width - starts[1], dtype=np.int32)
-    columns = np.empty_like(rows)
-    fill = starts - starts[1]
-    for i in range(height):
-        for j in range(width):
-            k = label[i, j]
-            if k > 0:
-                rows[fill[k]], columns[fill[k]] = i, j
-                fill[k] += 1
-                label[i, j] = 0
-    along = np.empty(len(rows))
+    pieces = [(np.int64(0), np.int64(0))]
     stack = [(np.int64(0), np.int64(0))]
+    pieces.pop()
     stack.pop()
-    found = 0
-    for k in range(1, count + 1):
-        stack.append((starts[k] - starts[1], starts[k + 1] - starts[1]))
+    for chain in range(len(starts) - 1):
+        stack.append((starts[chain], starts[chain + 1]))
         while len(stack) > 0:
             begin, end = stack.pop()
-            if end - begin < least_cells:
+            path = cells[begin:end]
+            du, dv = path[-1, 1] - path[0, 1], path[-1, 0] - path[0, 0]
+            if np.sqrt(du * du + dv * dv) < least_cells:
                 continue
             mean = 0.0
-            for n in range(begin, end):
-                mean += log_radius[rows[n], columns[n]]
-            radius = np.exp(mean / (end - begin))
-            own = along[begin:end]
-            where = _cut(rows[begin:end], columns[begin:end], radius, rule, own)
-            if where == np.inf:
-                found += 1
-                for n in range(begin, end):
-                    label[rows[n], columns[n]] = found
-                continue
-            middle = begin
-            for n in range(begin, end):
-                if along[n] < where:
-                    rows[n], rows[middle] = rows[middle], rows[n]
-                    columns[n], columns[middle] = columns[middle], columns[n]
-                    along[n], along[middle] = along[middle], along[n]
-                    middle += 1
-            if middle == begin or middle == end:
-                continue
-            stack.append((begin, middle))
-            stack.append((middle, end))
+            for k in range(len(path)):
+                mean += log_radius[path[k, 0], path[k, 1]]
+            cut = _bend(path, np.exp(mean / len(path)), rule)
+            if cut < 0:
+                pieces.append((begin, end))
+            else:
+                stack.append((begin + cut, end))
+                stack.append((begin, begin + cut))
+    out = np.empty((len(pieces), 2), dtype=np.int64)
+    for k in range(len(pieces)):
+        out[k, 0], out[k, 1] = pieces[k]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def painted(cells: I32, pieces: I64, log_radius: F32, label: I32) -> int:
+    """Number pieces in `label` (h, w) in the order given; return how many.
+
+    A piece most of which runs beside an earlier one, closer than half a radius, is its double and
+    is left out.
+    """
+    height, width = label.shape
+    taken = np.zeros(label.shape, dtype=np.bool_)
+    label[:] = 0
+    found = 0
+    for begin, end in pieces:
+        double = 0
+        for k in range(begin, end):
+            double += taken[cells[k, 0], cells[k, 1]]
+        if 2 * double > end - begin:
+            continue
+        found += 1
+        for k in range(begin, end):
+            i, j = cells[k]
+            if not taken[i, j]:
+                label[i, j] = found
+        for k in range(begin, end):
+            i, j = cells[k]
+            near = max(0.5 * np.exp(log_radius[i, j]), 1.5)
+            reach = int(near)
+            for a in range(max(i - reach, 0), min(i + reach + 1, height)):
+                for b in range(max(j - reach, 0), min(j + reach + 1, width)):
+                    if (a - i) ** 2 + (b - j) ** 2 <= near * near:
+                        taken[a, b] = True
     return found
 
 

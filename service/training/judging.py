@@ -46,15 +46,16 @@ def sight(
     strands = grouped(maps, grouping)
     scores = calibration.scores(strands.features)
     size = image.ignore.shape[0], image.ignore.shape[1]
-    masks = masks_of(strands, maps[0], scores, size, least_score=0.0)
+    masks = masks_of(strands, scores, size, least_score=0.0)
+    own = np.array([mask.instance - 1 for mask in masks], dtype=np.int64)
     ignored = np.array([_ignored(mask, image.ignore) for mask in masks], dtype=bool)
-    judged = judge([_line(mask) for mask in masks], scores, ignored, image.lines)
+    judged = judge([_line(mask) for mask in masks], scores[own], ignored, image.lines)
     true = image.instances > 0
     sure = [mask for mask in masks if mask.confidence >= least_score]
     found = [_pixels(some, size) & ~image.ignore for some in (masks, sure)]
     return Sighting(
         judged=judged,
-        features=strands.features[judged.number],
+        features=strands.features[own[judged.number]],
         common=np.array([(pixels & true).sum() for pixels in found]),
         either=np.array([(pixels | true).sum() for pixels in found]),
     )

@@ -88,6 +88,7 @@ def train(
         UsageError: there are no pictures to train on.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)  # a second one brings next to nothing, and the core is wanted
     fast = has_fast_bfloat16()
     while run.progress < 1.0:
         pictures = images()

@@ -1,7 +1,8 @@
 """From the network's maps to instances: slender, straight, disjoint (no boxes, no suppression).
 
-The middle lines of neighbouring branches lie apart even where their masks touch, so strands are
-linked along the middle, cut where they bend, and then grown to their full width.
+The middle lines of neighbouring branches lie apart even where their masks touch: the
+middle-line map is thinned, chained along the direction field, cut where it bends, and grown to
+full width.
 """
 
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from canopy_skel.geometry import FloatArray
 from canopy_skel.kernels import strands
 from canopy_skel.segmenters.unet.targets import STRIDE
 
+_TRIES = 5
 FEATURES = ("branch", "centre", "direction", "fill", "log_length", "log_radius")
 
 
@@ -45,10 +47,12 @@ class Strands:
 
     label: (h, w) int32, 0 = none. features: (N, len(FEATURES)) of instance i at i - 1: mean
     probabilities of branch and middle line, agreement of direction, area over that of a strip of
-    the length and radius, logarithms of length and radius in pixels.
+    the length and radius, logarithms of length and radius in pixels. surplus: (h, w), how far
+    the branch logit is above the threshold.
     """
 
     label: strands.I32
+    surplus: Float32Array
     features: FloatArray
 
 
@@ -56,17 +60,26 @@ def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
     """Group (5, h, w) maps: logits of branch and centre, cos 2θ, sin 2θ, log radius in pixels."""
     log_cell = np.float32(np.log(STRIDE))
     inside = maps[0] > _logit(grouping.branch)
-    core = inside & (maps[1] > _logit(grouping.centre))
-    smooth = np.zeros_like(maps[2:])
-    strands.smoothed(inside, maps[2:], smooth)
-    smooth[2] -= log_cell
+    smooth = np.zeros_like(maps[1:])
+    strands.smoothed(inside, maps[1:], smooth)
+    centre, field = smooth[0], smooth[1:]
+    field[2] -= log_cell
+    core = inside & (centre > _logit(grouping.centre))
+    core[[0, -1]], core[:, [0, -1]] = False, False
+    cells = strands.thinned(core)
+    number = np.full(inside.shape, -1, dtype=np.int32)
+    number[cells[:, 0], cells[:, 1]] = np.arange(len(cells))
+    gate = np.array([np.cos(2 * np.radians(grouping.gate_deg)), grouping.ratio])
+    order, starts = strands.chains(strands.links(number, cells, field, gate, _TRIES))
+    cells = cells[order]
+    rule = np.array([grouping.bend_px / STRIDE, grouping.bend_share, grouping.bend_radii])
+    least = 0.6 * grouping.least_length_px / STRIDE
+    pieces = strands.straight_pieces(cells, starts, field[2], rule, least)
+    longest_first = np.argsort(pieces[:, 0] - pieces[:, 1], kind="stable")
     label = np.empty(inside.shape, dtype=np.int32)
-    turn = float(np.cos(2 * np.radians(grouping.gate_deg)))
-    count = strands.linked(core, smooth, turn, grouping.ratio, label)
-    rule = np.array([grouping.bend_px / STRIDE, grouping.bend_share, grouping.bend_radii, 12.0])
-    count = strands.straightened(label, count, smooth[2], 4, rule)
-    strands.grown(label, inside, smooth[2], grouping.reach)
-    return _kept(label, count, maps, smooth, grouping)
+    count = strands.painted(cells, pieces[longest_first], field[2], label)
+    strands.grown(label, inside, field[2], grouping.reach)
+    return _kept(label, count, maps, field[2], grouping)
 
 
 def _logit(probability: float) -> float:
@@ -74,7 +87,7 @@ def _logit(probability: float) -> float:
 
 
 def _kept(
-    label: strands.I32, count: int, maps: Float32Array, smooth: Float32Array, grouping: Grouping
+    label: strands.I32, count: int, maps: Float32Array, log_radius: Float32Array, grouping: Grouping
 ) -> Strands:
     """Measure the strands and keep those large enough."""
     rows, columns = np.nonzero(label)
@@ -85,7 +98,7 @@ def _kept(
 
     cells = np.maximum(np.bincount(own, minlength=count), 1)
     length = STRIDE * _lengths(rows, columns, own, cells)
-    radius = STRIDE * np.exp(mean(smooth[2, rows, columns]))
+    radius = STRIDE * np.exp(mean(log_radius[rows, columns]))
     pixels = STRIDE**2 * cells
     wanted = (pixels >= grouping.least_pixels) & (length >= grouping.least_length_px)
     wanted &= length > 1.2 * pixels / length
@@ -101,7 +114,11 @@ def _kept(
     )
     number = np.zeros(count + 1, dtype=np.int32)
     number[1:][wanted] = np.arange(1, int(wanted.sum()) + 1)
-    return Strands(label=number[label], features=features[wanted])
+    return Strands(
+        label=number[label],
+        surplus=maps[0] - np.float32(_logit(grouping.branch)),
+        features=features[wanted],
+    )
 
 
 def _lengths(

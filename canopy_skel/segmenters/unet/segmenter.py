@@ -10,6 +10,7 @@ from scipy.ndimage import find_objects
 
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, UInt8Array, View
+from canopy_skel.geometry import FloatArray
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.unet.grouping import Strands, grouped
 from canopy_skel.segmenters.unet.network import MULTIPLE_PX, normalised
@@ -76,7 +77,7 @@ class UNetSegmenter:
             ) from error
         strands = grouped(maps, self._model.grouping)
         scores = self._model.calibration.scores(strands.features)
-        return masks_of(strands, maps[0], scores, color.shape[:2], self._model.least_score)
+        return masks_of(strands, scores, color.shape[:2], self._model.least_score)
 
     def maps(self, color_rgb: UInt8Array) -> Float32Array:
         """Return the five maps (5, ceil(H / 2), ceil(W / 2)) of an (H, W, 3) picture.
@@ -137,13 +138,13 @@ def _spans(size: int, tile_px: int) -> Iterator[tuple[slice, slice]]:
 
 
 def masks_of(
-    strands: Strands,
-    branch_logit: Float32Array,
-    scores: np.ndarray,
-    size: tuple[int, int],
-    least_score: float,
+    strands: Strands, scores: FloatArray, size: tuple[int, int], least_score: float
 ) -> list[BranchMask]:
-    """Return the instances of at least a score at the picture's own size (height, width)."""
+    """Return the instances of at least a score at the picture's own size (height, width).
+
+    They keep their numbers in `strands`. Their outlines run where the branch map, interpolated
+    between cells, falls to its threshold.
+    """
     height, width = size
     masks: list[BranchMask] = []
     for number, box in enumerate(find_objects(strands.label), start=1):
@@ -152,13 +153,13 @@ def masks_of(
         top, left = STRIDE * box[0].start, STRIDE * box[1].start
         own = (strands.label[box] == number).astype(np.uint8)
         full = (own.shape[1] * STRIDE, own.shape[0] * STRIDE)
-        sharp = cv2.resize(branch_logit[box], full, interpolation=cv2.INTER_LINEAR) > 0
+        sharp = cv2.resize(strands.surplus[box], full, interpolation=cv2.INTER_LINEAR) > 0
         mask = sharp & (cv2.resize(own, full, interpolation=cv2.INTER_NEAREST) > 0)
         mask = mask[: height - top, : width - left]
         if mask.any():
             masks.append(
                 BranchMask(
-                    instance=len(masks) + 1,
+                    instance=number,
                     left_px=left,
                     top_px=top,
                     mask=mask,

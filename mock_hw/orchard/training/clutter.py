@@ -34,8 +34,9 @@ def clouds(rng: np.random.Generator, size: Size, cells: float, octaves: int = 4)
     total, weight = np.zeros(size, dtype=np.float32), 0.0
     for octave in range(octaves):
         across = max(int(cells * 2**octave), 2)
-        if across > width:
+        if octave and across > width:
             break
+        across = min(across, width)
         grid = rng.random((max(across * height // width, 2), across), dtype=np.float32)
         share = 0.55**octave
         total += share * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
