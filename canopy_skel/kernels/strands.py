@@ -41,39 +41,40 @@ def smoothed(inside: Bool, maps: F32, out: F32) -> None:
 
 
 @njit(cache=True)
-def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
-    """Say whether a cell may go in this half of a round of Zhang and Suen (1984)."""
-    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
-    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
-    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
-    count = int(p2) + p3 + p4 + p5 + p6 + p7 + p8 + p9
-    if count < 2 or count > 6:
-        return False
-    turns = int(not p2 and p3) + int(not p3 and p4) + int(not p4 and p5) + int(not p5 and p6)
-    turns += int(not p6 and p7) + int(not p7 and p8) + int(not p8 and p9) + int(not p9 and p2)
-    if turns != 1:
-        return False
-    if second:
-        return not (p2 and p4 and p8) and not (p2 and p6 and p8)
-    return not (p2 and p4 and p6) and not (p4 and p6 and p8)
-
-
-@njit(cache=True)
-def _is_corner(core: Bool, i: int, j: int) -> bool:
-    """Say whether a line runs on without a cell of it, diagonally (Yokoi's number is 1)."""
+def _joins_nothing(core: Bool, i: int, j: int) -> bool:
+    """Say whether a cell is neither the end of a line nor what holds two parts together."""
     p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
     p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
     p8, p9 = core[i, j - 1], core[i - 1, j - 1]
     parts = int(not p2 and (p3 or p4)) + int(not p4 and (p5 or p6))
     parts += int(not p6 and (p7 or p8)) + int(not p8 and (p9 or p2))
-    return parts == 1 and int(p2) + p3 + p4 + p5 + p6 + p7 + p8 + p9 >= 2
+    if parts != 1:
+        return False
+    one = int(p9 or p2) + int(p3 or p4) + int(p5 or p6) + int(p7 or p8)
+    two = int(p2 or p3) + int(p4 or p5) + int(p6 or p7) + int(p8 or p9)
+    return min(one, two) >= 2
+
+
+@njit(cache=True)
+def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
+    """Say whether a cell may go in this half of a round of Guo and Hall (1989)."""
+    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
+    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
+    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
+    one = int(p9 or p2) + int(p3 or p4) + int(p5 or p6) + int(p7 or p8)
+    two = int(p2 or p3) + int(p4 or p5) + int(p6 or p7) + int(p8 or p9)
+    if min(one, two) > 3 or not _joins_nothing(core, i, j):
+        return False
+    if second:
+        return not ((p2 or p3 or not p5) and p4)
+    return not ((p6 or p7 or not p9) and p8)
 
 
 @njit(cache=True, nogil=True)
 def thinned(core: Bool) -> I32:
     """Thin a core (h, w) to lines one cell wide, in place; return (N, 2) row and column of them.
 
-    Its outermost cells must be False.
+    Its outermost cells must be False. No line gets shorter than half its width.
     """
     height, width = core.shape
     live = np.empty((core.size, 2), dtype=np.int32)
@@ -90,25 +91,28 @@ def thinned(core: Bool) -> I32:
         for second in (False, True):
             for k in range(count):
                 marked[k] = _removable(core, live[k, 0], live[k, 1], second)
-            kept = 0
-            for k in range(count):
-                i, j = live[k, 0], live[k, 1]
-                if marked[k]:
-                    core[i, j] = False
-                    changed = True
-                else:
-                    live[kept, 0], live[kept, 1] = i, j
-                    kept += 1
-            count = kept
+            before, count = count, _swept(core, live, marked, count)
+            changed = changed or count < before
+    for k in range(count):
+        marked[k] = _joins_nothing(core, live[k, 0], live[k, 1])
+        if marked[k]:
+            core[live[k, 0], live[k, 1]] = False
+    count = _swept(core, live, marked, count)
+    return live[:count].copy()
+
+
+@njit(cache=True)
+def _swept(core: Bool, live: I32, marked: Bool, count: int) -> int:
+    """Take marked cells out of the core and of the list of live ones; return how many are left."""
     kept = 0
     for k in range(count):
         i, j = live[k, 0], live[k, 1]
-        if _is_corner(core, i, j):
+        if marked[k]:
             core[i, j] = False
         else:
             live[kept, 0], live[kept, 1] = i, j
             kept += 1
-    return live[:kept].copy()
+    return kept
 
 
 @njit(cache=True)
@@ -124,7 +128,7 @@ def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
     c, s = np.cos(angle), np.sin(angle)
     du, dv = b[1] - a[1], b[0] - a[0]
     along, across = c * du + s * dv, abs(c * dv - s * du)
-    aside = max(ACROSS * np.exp(log_radius), 1.0)
+    aside = max(ACROSS * np.exp(log_radius), 1.5)
     spread = 1.0 if abs(du) <= 1 and abs(dv) <= 1 else 0.5
     if abs(along) < 0.3 or abs(along) > window or across > min(aside, 0.3 + spread * abs(along)):
         return np.inf

@@ -21,13 +21,15 @@ _STEP_PX = 2.0
 class Judged:
     """The instances of one picture, matched.
 
-    scores: (N,) of the predictions that count, found: (N,) whether they are right. number: (N,)
-    which predictions those are; one that covers only what is to be ignored does not count.
-    matched: (truths,) which true instances were found.
+    scores: (N,) of the predictions that count. found: (N,) whether they are a true instance, one
+    to one; real: (N,) whether they are branches at all, be it part of one or two in a row.
+    number: (N,) which predictions those are; one that covers only what is to be ignored does not
+    count. matched: (truths,) which true instances were found.
     """
 
     scores: FloatArray
     found: BoolArray
+    real: BoolArray
     number: IntArray
     matched: BoolArray
 
@@ -87,18 +89,36 @@ def judge(
     found = np.zeros(len(lines), dtype=bool)
     matched = np.zeros(len(truths), dtype=bool)
     boxes = [_box(truth) for truth in truths]
+    real = np.zeros(len(lines), dtype=bool)
     for number in np.argsort(-scores, kind="stable"):
         best, where = 0.0, -1
         low, high = _box(lines[number])
-        for k, (bottom, top) in enumerate(boxes):
-            if not matched[k] and (low <= top).all() and (bottom <= high).all():
-                share = on_line(lines[number], truths[k])
-                if share > best:
-                    best, where = share, k
+        near = [k for k, (a, b) in enumerate(boxes) if (low <= b).all() and (a <= high).all()]
+        real[number] = _on_any(lines[number], [truths[k] for k in near]) > OVERLAP
+        for k in near:
+            share = 0.0 if matched[k] else on_line(lines[number], truths[k])
+            if share > best:
+                best, where = share, k
         if where >= 0:
             found[number], matched[where] = True, True
-    counted = np.flatnonzero(found | ~ignored)
-    return Judged(scores=scores[counted], found=found[counted], number=counted, matched=matched)
+    counted = np.flatnonzero(found | real | ~ignored)
+    return Judged(
+        scores=scores[counted],
+        found=found[counted],
+        real=(found | real)[counted],
+        number=counted,
+        matched=matched,
+    )
+
+
+def _on_any(line: FloatArray, truths: Sequence[FloatArray]) -> float:
+    """Return the share of a line that lies on true ones of about its direction."""
+    points = _samples(line)
+    on = np.zeros(len(points), dtype=bool)
+    for truth in truths:
+        if _turn_deg(line, truth) < 2 * TURN_DEG:
+            on |= _distance(points, truth) < truth[:, 2].mean() + TOLERANCE_PX
+    return float(on.mean())
 
 
 def _box(line: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -121,18 +141,23 @@ def average_precision(judged: Sequence[Judged]) -> float:
 
 
 def precision_and_recall(judged: Sequence[Judged], least_score: float) -> tuple[float, float]:
-    """Return both for the predictions with at least a score; precision is 1 if there are none."""
+    """Return both for the predictions with at least a score; precision is 1 if there are none.
+
+    Precision is the share that is real, since what harms a map is a branch that is none; recall is
+    the share of true instances found one to one.
+    """
     hits = sum(int((p.found & (p.scores >= least_score)).sum()) for p in judged)
+    real = sum(int((p.real & (p.scores >= least_score)).sum()) for p in judged)
     count = sum(int((p.scores >= least_score).sum()) for p in judged)
     truths = sum(picture.truths for picture in judged)
-    return hits / count if count else 1.0, hits / truths if truths else 0.0
+    return real / count if count else 1.0, hits / truths if truths else 0.0
 
 
-def calibration_error(scores: FloatArray, found: BoolArray, bins: int = 10) -> float:
-    """Return the expected calibration error: |share found - mean score|, weighed over bins."""
+def calibration_error(scores: FloatArray, real: BoolArray, bins: int = 10) -> float:
+    """Return the expected calibration error: |share real - mean score|, weighed over bins."""
     if len(scores) == 0:
         return 0.0
     place = np.minimum((scores * bins).astype(np.int64), bins - 1)
     count = np.bincount(place, minlength=bins)
-    apart = np.bincount(place, found, bins) - np.bincount(place, scores, bins)
+    apart = np.bincount(place, real, bins) - np.bincount(place, scores, bins)
     return float(np.abs(apart).sum() / count.sum())

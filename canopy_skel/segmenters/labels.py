@@ -67,6 +67,31 @@ def line_of_mask(mask: BoolArray, bins: int = 8) -> FloatArray:
     return np.column_stack([line, np.concatenate([radius[:1], radius, radius[-1:]])])
 
 
+def without_small(
+    image: LabelledImage, *, pixels: int = 150, width_px: float = 2.5, length_px: float = 40.0
+) -> LabelledImage:
+    """Return the picture with instances too small to be asked of anybody turned into `ignore`.
+
+    width_px: mean width, pixels over length. The limits are those of what a recording counts as
+    detectable (5 cm of wood at 1.1 m with an OAK-D).
+    """
+    number = np.zeros(len(image.lines) + 1, dtype=np.uint16)
+    area = np.bincount(image.instances.ravel(), minlength=len(number))
+    kept = []
+    for k, line in enumerate(image.lines, start=1):
+        length = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
+        if area[k] >= pixels and length >= length_px and area[k] >= width_px * length:
+            kept.append(line)
+            number[k] = len(kept)
+    instances = number[image.instances]
+    return LabelledImage(
+        color_rgb=image.color_rgb,
+        instances=instances,
+        lines=tuple(kept),
+        ignore=image.ignore | ((image.instances > 0) & (instances == 0)),
+    )
+
+
 def labelled_image(
     color_rgb: UInt8Array, masks: Sequence[BoolArray], ignore: BoolArray
 ) -> LabelledImage:

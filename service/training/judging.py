@@ -92,7 +92,7 @@ def figures(sightings: Sequence[Sighting], least_score: float) -> dict[str, floa
         "pixel_iou": float(common[1] / max(either[1], 1)),
         "pixel_iou_any_score": float(common[0] / max(either[0], 1)),
         "calibration_error": calibration_error(
-            np.concatenate([j.scores for j in judged]), np.concatenate([j.found for j in judged])
+            np.concatenate([j.scores for j in judged]), np.concatenate([j.real for j in judged])
         ),
         "instances": float(sum(j.truths for j in judged)),
         "pictures": float(len(judged)),
@@ -100,9 +100,9 @@ def figures(sightings: Sequence[Sighting], least_score: float) -> dict[str, floa
 
 
 def calibrated(sightings: Sequence[Sighting]) -> Calibration:
-    """Return the logistic regression of being right on the features (ridge, standardised)."""
+    """Return the logistic regression of being real on the features (ridge, standardised)."""
     x = np.concatenate([s.features for s in sightings])
-    y = np.concatenate([s.judged.found for s in sightings]).astype(np.float64)
+    y = np.concatenate([s.judged.real for s in sightings]).astype(np.float64)
     middle, spread = x.mean(axis=0), x.std(axis=0) + 1e-9
     z = (x - middle) / spread
 

@@ -12,7 +12,7 @@ import torch
 
 from canopy_skel.errors import UsageError
 from canopy_skel.frame import Float32Array
-from canopy_skel.segmenters.labels import LabelledImage
+from canopy_skel.segmenters.labels import LabelledImage, without_small
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
@@ -41,7 +41,7 @@ class Halves:
 
 def halves_of(images: StoredImages) -> Halves:
     """Split by scene, not by picture: the names start with the scene's number."""
-    own = [(name, images[k]) for k, name in enumerate(images.names)]
+    own = [(name, without_small(images[k])) for k, name in enumerate(images.names)]
     scenes = sorted({name.split("-")[0] for name, _ in own})
     first = set(scenes[: len(scenes) // 2])
     return Halves(

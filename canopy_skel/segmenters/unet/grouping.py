@@ -29,12 +29,12 @@ class Grouping:
     middle.
     """
 
-    branch: float = 0.5
-    centre: float = 0.4
+    branch: float = 0.3
+    centre: float = 0.05
     gate_deg: float = 14.0
     ratio: float = 0.6
     bend_px: float = 2.0
-    bend_share: float = 0.08
+    bend_share: float = 0.1
     bend_radii: float = 0.5
     reach: float = 1.3
     least_pixels: int = 100
