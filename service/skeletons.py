@@ -9,7 +9,6 @@ from canopy_skel.segment import Segmenter
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
 
-
 def _unet() -> Segmenter:
     """Return the learned segmenter with the built-in weights."""
     # Imported here: torch takes seconds to load, and only this segmenter needs it.

@@ -7,12 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from canopy_skel.errors import UsageError
-from canopy_skel.frame import Float32Array
 from canopy_skel.segmenters.labels import LabelledImage, without_small
+from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
@@ -24,8 +23,8 @@ from service.training.loop import Plan, Run, resume, start, train
 from service.training.store import StoredImages
 
 WANTED_PRECISION = 0.87
-_CANDIDATES = 5
-_UNCALIBRATED = Calibration(weights=(4.0, 2.0, 2.0, 0.0, 0.3, 0.0), bias=-6.0)
+_CANDIDATES = 3
+_UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
 BUILTIN_PLAN = Plan(steps=8000)
 
 Progress = Callable[[str, int, int], None]
@@ -39,15 +38,20 @@ class Halves:
     report: Sequence[LabelledImage]
 
 
+def choosing(images: StoredImages) -> list[int]:
+    """Return the pictures of the first half of the scenes; names start with a scene's number."""
+    scenes = [name.split("-")[0] for name in images.names]
+    first = set(sorted(set(scenes))[: len(set(scenes)) // 2])
+    return [number for number, scene in enumerate(scenes) if scene in first]
+
+
 def halves_of(images: StoredImages) -> Halves:
-    """Split by scene, not by picture: the names start with the scene's number."""
-    own = [(name, without_small(images[k])) for k, name in enumerate(images.names)]
-    scenes = sorted({name.split("-")[0] for name, _ in own})
-    first = set(scenes[: len(scenes) // 2])
-    return Halves(
-        choose=[image for name, image in own if name.split("-")[0] in first],
-        report=[image for name, image in own if name.split("-")[0] not in first],
-    )
+    """Split a set by scene, not by picture."""
+    first = set(choosing(images))
+    halves: tuple[list[LabelledImage], list[LabelledImage]] = ([], [])
+    for number in range(len(images)):
+        halves[number not in first].append(without_small(images[number]))
+    return Halves(choose=halves[0], report=halves[1])
 
 
 def builtin_weights(
@@ -62,19 +66,11 @@ def builtin_weights(
     run = resume(plan, folder / "run") or start(plan)
     validate = StoredImages(folder / "data" / "validate")
     pictures = StoredImages(folder / "data" / "train")
-    train(run, lambda: pictures, folder / "run", Look(validate, halves_of_names(validate)))
+    train(run, lambda: pictures, folder / "run", Look(validate, choosing(validate)[::2]))
     model, facts = finish(run, folder / "run", halves_of(validate))
     facts["training"] |= {"pictures": len(pictures), "data": digest(pictures)}
     save(output, model, facts)
     return facts
-
-
-def halves_of_names(images: StoredImages) -> list[int]:
-    """Return the pictures of the choosing half that are looked at during training."""
-    scenes = sorted({name.split("-")[0] for name in images.names})
-    first = set(scenes[: len(scenes) // 2])
-    chosen = [k for k, name in enumerate(images.names) if name.split("-")[0] in first]
-    return chosen[::2]
 
 
 def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any]]:
@@ -153,6 +149,6 @@ def digest(images: StoredImages) -> str:
     total = hashlib.sha256()
     for k, name in enumerate(images.names):
         total.update(name.encode())
-        total.update(np.ascontiguousarray(images.color(k)))
-        total.update(np.ascontiguousarray(images.maps(k)))
+        total.update(images.color(k).tobytes())
+        total.update(images.maps(k).tobytes())
     return total.hexdigest()
