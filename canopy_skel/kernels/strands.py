@@ -218,8 +218,8 @@ def chains(link: I32) -> tuple[I32, I64]:
     return order, np.array(starts)
 
 
-@njit(cache=True)
-def _bend(path: I32, radius: float, rule: F64) -> int:
+@njit(cache=True, nogil=True)
+def bend(path: I32, radius: float, rule: F64) -> int:
     """Return which cell of a path lies farthest off its chord if that is a bend, else -1.
 
     rule: least offset, share of the length, share of the radius.
@@ -241,7 +241,7 @@ def _bend(path: I32, radius: float, rule: F64) -> int:
 def straight_pieces(cells: I32, starts: I64, log_radius: F32, rule: F64, least_cells: float) -> I64:
     """Cut chains where they bend; return (M, 2) begin and end of the pieces long enough.
 
-    cells: (N, 2) in the order of their chains. rule: see `_bend`.
+    cells: (N, 2) in the order of their chains. rule: see `bend`.
     """
     pieces = [(np.int64(0), np.int64(0))]
     stack = [(np.int64(0), np.int64(0))]
@@ -258,7 +258,7 @@ def straight_pieces(cells: I32, starts: I64, log_radius: F32, rule: F64, least_c
             mean = 0.0
             for k in range(len(path)):
                 mean += log_radius[path[k, 0], path[k, 1]]
-            cut = _bend(path, np.exp(mean / len(path)), rule)
+            cut = bend(path, np.exp(mean / len(path)), rule)
             if cut < 0:
                 pieces.append((begin, end))
             else:

@@ -1,6 +1,7 @@
 """The recipe of the built-in weights: draw, train, choose, calibrate, describe."""
 
 import hashlib
+import json
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,10 +23,10 @@ from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
 from service.training.store import StoredImages
 
-WANTED_PRECISION = 0.87
+WANTED_PRECISION = 0.92
 _CANDIDATES = 3
 _UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
-BUILTIN_PLAN = Plan(steps=8000)
+BUILTIN_PLAN = Plan(steps=6000, look_every=200)
 
 Progress = Callable[[str, int, int], None]
 
@@ -74,16 +75,14 @@ def builtin_weights(
 
 
 def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any]]:
-    """Choose among the last averages of a run by line-AP, calibrate, and measure.
+    """Choose among the averages that looked best by line-AP, calibrate, and measure.
 
     Raises:
         UsageError: the folder holds no averaged weights.
     """
-    paths = sorted(folder.glob("average-*.pt"))[-_CANDIDATES:]
-    if not paths:
-        raise UsageError(f"{folder}: holds no averaged weights; train first")
-    candidates = [_candidate(path, run.plan.channels, halves.choose) for path in paths]
-    model, chosen = max(candidates, key=lambda pair: figures(pair[1], 0.0)["line_ap"])
+    paths = _promising(folder)
+    candidates = [(path, *_candidate(path, run.plan.channels, halves.choose)) for path in paths]
+    chosen_path, model, chosen = max(candidates, key=lambda c: _line_ap(c[2]))
     calibration = calibrated(chosen)
     least = threshold([s.judged for s in _scored(chosen, calibration)], WANTED_PRECISION)
     model = replace(model, calibration=calibration, least_score=least)
@@ -96,12 +95,23 @@ def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any
         "training": {
             "plan": asdict(run.plan),
             "steps": run.step,
+            "chosen": chosen_path.name,
             "minutes": round(run.seconds / 60, 1),
             "torch": torch.__version__,
             "machine": platform.processor() or platform.machine(),
         },
     }
     return model, facts
+
+
+def _promising(folder: Path) -> list[Path]:
+    """Return the averages that looked best during training."""
+    try:
+        log = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    except OSError as error:
+        raise UsageError(f"{folder}: holds no training log; train first") from error
+    best = sorted(log, key=lambda entry: -float(entry["val_iou"]))[:_CANDIDATES]
+    return [folder / f"average-{entry['step']:06d}.pt" for entry in best]
 
 
 def _candidate(
@@ -138,6 +148,10 @@ def _scored(sightings: Sequence[Sighting], calibration: Calibration) -> list[Sig
         replace(s, judged=replace(s.judged, scores=calibration.scores(s.features)))
         for s in sightings
     ]
+
+
+def _line_ap(sightings: Sequence[Sighting]) -> float:
+    return figures(_scored(sightings, calibrated(sightings)), 0.0)["line_ap"]
 
 
 def _rounded(values: dict[str, float]) -> dict[str, float]:

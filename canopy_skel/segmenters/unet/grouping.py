@@ -14,6 +14,7 @@ from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray
 from canopy_skel.kernels import strands
 from canopy_skel.segmenters.unet.features import measured
+from canopy_skel.segmenters.unet.joining import joined
 from canopy_skel.segmenters.unet.targets import STRIDE
 
 _TRIES = 5
@@ -31,7 +32,7 @@ class Grouping:
     """
 
     branch: float = 0.4
-    centre: float = 0.1
+    centre: float = 0.15
     gate_deg: float = 14.0
     ratio: float = 0.6
     bend_px: float = 2.0
@@ -72,11 +73,14 @@ def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
     order, starts = strands.chains(strands.links(number, cells, field, gate, _TRIES))
     cells = cells[order]
     rule = np.array([grouping.bend_px / STRIDE, grouping.bend_share, grouping.bend_radii])
-    least = 0.6 * grouping.least_length_px / STRIDE
+    least = 0.4 * grouping.least_length_px / STRIDE
     pieces = strands.straight_pieces(cells, starts, field[2], rule, least)
-    longest_first = np.argsort(pieces[:, 0] - pieces[:, 1], kind="stable")
+    paths = joined([cells[begin:end] for begin, end in pieces], field[2], rule)
+    paths.sort(key=len, reverse=True)
+    ends = np.cumsum([0, *map(len, paths)])
     label = np.empty(inside.shape, dtype=np.int32)
-    count = strands.painted(cells, pieces[longest_first], field[2], label)
+    together = np.concatenate([np.empty((0, 2), np.int32), *paths])
+    count = strands.painted(together, np.stack([ends[:-1], ends[1:]], axis=1), field[2], label)
     middle = label.copy()
     strands.grown(label, inside, field[2], grouping.reach)
     measures = measured(label, middle, count, maps, field[2])
