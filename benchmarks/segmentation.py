@@ -184,7 +184,8 @@ def page(rows, seconds):
             for name, half in (("chosen on", "chosen_on"), ("**reported**", "reported"))
         ),
         "",
-        "Seen, labelled (grey: too small), found; from the reporting half: ![sheet](sheet.jpg)",
+        "Seen, labelled (grey: too small), found:",
+        "![Pictures of the reporting half in three columns](sheet.jpg)",
         "",
         "## End to end, on recordings of another generator",
         "",

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Annotated
 
 import typer
+from rich.progress import TaskID
 
 from canopy_skel.errors import UsageError
 from service.cli.shell import AsJson, Out, progress_bars
@@ -44,7 +45,7 @@ def train(
     if scenes is not None:
         amounts = Amounts(train_scenes=scenes, validate_scenes=max(scenes // 10, 2))
     with progress_bars() as progress:
-        tasks = {}
+        tasks: dict[str, TaskID] = {}
 
         def show(name: str, done: int, total: int) -> None:
             if name not in tasks:

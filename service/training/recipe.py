@@ -67,7 +67,13 @@ def builtin_weights(
     run = resume(plan, folder / "run") or start(plan)
     validate = StoredImages(folder / "data" / "validate")
     pictures = StoredImages(folder / "data" / "train")
-    train(run, lambda: pictures, folder / "run", Look(validate, choosing(validate)[::2]))
+    look = Look(validate, choosing(validate)[::2])
+
+    def looked(network: UNet) -> dict[str, float]:
+        progress("steps", run.step, plan.steps)
+        return look(network)
+
+    train(run, lambda: pictures, folder / "run", looked)
     model, facts = finish(run, folder / "run", halves_of(validate))
     facts["training"] |= {"pictures": len(pictures), "data": digest(pictures)}
     save(output, model, facts)
