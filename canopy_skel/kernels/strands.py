@@ -1,8 +1,8 @@
 """From maps of middle line, direction and radius to strands: thinned, chained, cut, grown out.
 
 Cells are those of the network's output grid; lengths and radii here are in cells, u to the right
-and v down. A cell of a middle line links to at most one cell ahead and one behind, so that a fork never
-makes one strand of two branches.
+and v down. A cell of a middle line links to at most one cell ahead and one behind, so that a fork
+never makes one strand of two branches.
 """
 
 import numpy as np
@@ -136,7 +136,7 @@ def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
     if cosine < gate[0] or abs(maps[2, b[0], b[1]] - log_radius) > gate[1]:
         return np.inf
     price = abs(along) + 2.0 * across + 4.0 * (1.0 - cosine)
-    return price if along > 0 else -price
+    return float(price if along > 0 else -price)
 
 
 @njit(cache=True)
@@ -149,9 +149,9 @@ def _window(log_radius: float, tries: int) -> int:
 def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
     """Return (N, 2) the cell that each is linked with behind and ahead, -1 = none.
 
-    number: (h, w) the place in `cells`, -1 = none; cells: (N, 2) row and column. gate: see `_price`. A link is
-    made where it is the best for both of its cells among those still free on that side; then
-    those left over try again.
+    number: (h, w) the place in `cells`, -1 = none; cells: (N, 2) row and column. gate: see
+    `_price`. A link is made where it is the best for both of its cells among those still free on
+    that side; then those left over try again.
     """
     height, width = number.shape
     link = np.full((len(cells), 2), -1, dtype=np.int32)
@@ -214,12 +214,12 @@ def chains(link: I32) -> tuple[I32, I64]:
                     here = b
                 else:
                     here = -1
-            starts.append(filled)
+            starts.append(np.int64(filled))
     return order, np.array(starts)
 
 
-@njit(cache=True)
-def _bend(path: I32, radius: float, rule: F64) -> int:
+@njit(cache=True, nogil=True)
+def bend(path: I32, radius: float, rule: F64) -> int:
     """Return which cell of a path lies farthest off its chord if that is a bend, else -1.
 
     rule: least offset, share of the length, share of the radius.
@@ -238,12 +238,10 @@ def _bend(path: I32, radius: float, rule: F64) -> int:
 
 
 @njit(cache=True, nogil=True)
-def straight_pieces(
-    cells: I32, starts: I64, log_radius: F32, rule: F64, least_cells: float
-) -> I64:
+def straight_pieces(cells: I32, starts: I64, log_radius: F32, rule: F64, least_cells: float) -> I64:
     """Cut chains where they bend; return (M, 2) begin and end of the pieces long enough.
 
-    cells: (N, 2) in the order of their chains. rule: see `_bend`.
+    cells: (N, 2) in the order of their chains. rule: see `bend`.
     """
     pieces = [(np.int64(0), np.int64(0))]
     stack = [(np.int64(0), np.int64(0))]
@@ -260,7 +258,7 @@ def straight_pieces(
             mean = 0.0
             for k in range(len(path)):
                 mean += log_radius[path[k, 0], path[k, 1]]
-            cut = _bend(path, np.exp(mean / len(path)), rule)
+            cut = bend(path, np.exp(mean / len(path)), rule)
             if cut < 0:
                 pieces.append((begin, end))
             else:
@@ -312,7 +310,11 @@ def grown(label: I32, inside: Bool, log_radius: F32, reach: float) -> None:
     label: (h, w), changed in place. The radius is that of the cell grown from.
     """
     height, width = label.shape
-    queue = np.empty((label.size, 4), dtype=np.int32)
+    most = 0
+    for i in range(height):
+        for j in range(width):
+            most += inside[i, j] or label[i, j] > 0
+    queue = np.empty((most, 4), dtype=np.int64)
     end = 0
     for i in range(height):
         for j in range(width):
@@ -321,8 +323,7 @@ def grown(label: I32, inside: Bool, log_radius: F32, reach: float) -> None:
                 end += 1
     begin = 0
     while begin < end:
-        i, j = np.int64(queue[begin, 0]), np.int64(queue[begin, 1])
-        y, x = np.int64(queue[begin, 2]), np.int64(queue[begin, 3])
+        i, j, y, x = queue[begin]
         begin += 1
         far = (reach * np.exp(log_radius[y, x]) + 1.0) ** 2
         for a, b in ((i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):

@@ -55,9 +55,14 @@ def on_line(line: FloatArray, truth: FloatArray) -> float:
 
 
 def _turn_deg(a: FloatArray, b: FloatArray) -> float:
-    u, v = a[-1, :2] - a[0, :2], b[-1, :2] - b[0, :2]
-    cosine = abs(float(u @ v)) / max(float(np.linalg.norm(u) * np.linalg.norm(v)), 1e-9)
-    return float(np.degrees(np.arccos(min(cosine, 1.0))))
+    """Return the angle between the principal axes of two lines."""
+    u, v = _axis(a), _axis(b)
+    return float(np.degrees(np.arccos(min(abs(float(u @ v)), 1.0))))
+
+
+def _axis(line: FloatArray) -> FloatArray:
+    points = _samples(line)
+    return np.asarray(np.linalg.eigh(np.cov(points.T))[1][:, 1])
 
 
 def _samples(line: FloatArray) -> FloatArray:

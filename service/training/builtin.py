@@ -17,7 +17,7 @@ VALIDATE = Variety(seed=20260102, species=(WALNUT,), strange=True)
 class Amounts:
     """How many scenes (of four pictures each) are drawn."""
 
-    train_scenes: int = 420
+    train_scenes: int = 140
     validate_scenes: int = 30
 
 

@@ -21,11 +21,14 @@ class Batch:
     maps: UInt8Array
 
 
-def draw_batch(images: StoredImages, rng: np.random.Generator, *, count: int, size_px: int) -> Batch:
+def draw_batch(
+    images: StoredImages, rng: np.random.Generator, *, count: int, size_px: int
+) -> Batch:
     """Draw `count` crops of `size_px`, from as many pictures."""
     crops = [_crop(images, int(rng.integers(len(images))), rng, size_px) for _ in range(count)]
     return Batch(
-        color_rgb=np.stack([color for color, _ in crops]), maps=np.stack([maps for _, maps in crops])
+        color_rgb=np.stack([color for color, _ in crops]),
+        maps=np.stack([maps for _, maps in crops]),
     )
 
 

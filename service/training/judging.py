@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -20,6 +21,7 @@ from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.labels import LabelledImage, line_of_mask
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping, grouped
 from canopy_skel.segmenters.unet.segmenter import masks_of
+from canopy_skel.segmenters.unet.targets import STRIDE
 
 _RIDGE = 1e-3
 
@@ -29,7 +31,7 @@ class Sighting:
     """What was found in one picture, however low its score.
 
     features: (N, F) of the instances of `judged`. common, either: (2,) pixels both found and true,
-    and found or true, ignored ones left out, of instances with any score and with enough.
+    and found or true, ignored ones left out: of the branch map, of the instances reported.
     """
 
     judged: Judged
@@ -39,7 +41,10 @@ class Sighting:
 
 
 def sight(
-    maps: Float32Array, image: LabelledImage, grouping: Grouping, calibration: Calibration,
+    maps: Float32Array,
+    image: LabelledImage,
+    grouping: Grouping,
+    calibration: Calibration,
     least_score: float,
 ) -> Sighting:
     """Group the maps of a picture and match what comes of it."""
@@ -52,7 +57,8 @@ def sight(
     judged = judge([_line(mask) for mask in masks], scores[own], ignored, image.lines)
     true = image.instances > 0
     sure = [mask for mask in masks if mask.confidence >= least_score]
-    found = [_pixels(some, size) & ~image.ignore for some in (masks, sure)]
+    whole = cv2.resize(maps[0], None, fx=STRIDE, fy=STRIDE)[: size[0], : size[1]] > 0
+    found = [pixels & ~image.ignore for pixels in (whole, _pixels(sure, size))]
     return Sighting(
         judged=judged,
         features=strands.features[own[judged.number]],
@@ -62,7 +68,7 @@ def sight(
 
 
 def _line(mask: BranchMask) -> FloatArray:
-    return line_of_mask(mask.mask) + np.array([mask.left_px, mask.top_px, 0.0])
+    return np.add(line_of_mask(mask.mask), (mask.left_px, mask.top_px, 0.0))
 
 
 def _ignored(mask: BranchMask, ignore: BoolArray) -> bool:
@@ -89,8 +95,8 @@ def figures(sightings: Sequence[Sighting], least_score: float) -> dict[str, floa
         "line_ap": average_precision(judged),
         "precision": precision,
         "recall": recall,
-        "pixel_iou": float(common[1] / max(either[1], 1)),
-        "pixel_iou_any_score": float(common[0] / max(either[0], 1)),
+        "pixel_iou": float(common[0] / max(either[0], 1)),
+        "pixel_iou_reported": float(common[1] / max(either[1], 1)),
         "calibration_error": calibration_error(
             np.concatenate([j.scores for j in judged]), np.concatenate([j.real for j in judged])
         ),

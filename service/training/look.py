@@ -57,5 +57,3 @@ def _compared(output: Maps, maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     true = maps[..., ANGLE] * (np.pi / ANGLE_STEPS)
     apart = np.abs(np.mod(angle - true + np.pi / 2, np.pi) - np.pi / 2)
     return np.array([c.sum() for c in counts], float), np.degrees(apart[found & wood])
-
-

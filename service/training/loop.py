@@ -15,7 +15,7 @@ from torch.optim import AdamW
 
 from canopy_skel.errors import UsageError
 from canopy_skel.segmenters.unet.loss import loss_of
-from canopy_skel.segmenters.unet.network import CHANNELS, UNet, maps_of, normalised
+from canopy_skel.segmenters.unet.network import CHANNELS, UNet, channels_last, maps_of, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from service.training.crops import draw_batch
 from service.training.store import StoredImages
@@ -64,7 +64,7 @@ class Run:
 def start(plan: Plan, init: dict[str, Tensor] | None = None) -> Run:
     """Return a run at its first step, from random weights or from given ones."""
     torch.manual_seed(plan.seed)
-    network = UNet(plan.channels).to(memory_format=torch.channels_last)
+    network = channels_last(UNet(plan.channels))
     if init is not None:
         network.load_state_dict(init)
     averaged = UNet(plan.channels)

@@ -1,18 +1,18 @@
 """The recipe of the built-in weights: draw, train, choose, calibrate, describe."""
 
 import hashlib
+import json
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from canopy_skel.errors import UsageError
-from canopy_skel.frame import Float32Array
 from canopy_skel.segmenters.labels import LabelledImage, without_small
+from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
@@ -23,10 +23,10 @@ from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
 from service.training.store import StoredImages
 
-WANTED_PRECISION = 0.87
-_CANDIDATES = 5
-UNCALIBRATED = Calibration(weights=(4.0, 2.0, 2.0, 0.0, 0.3, 0.0), bias=-6.0)
-BUILTIN_PLAN = Plan(steps=8000)
+WANTED_PRECISION = 0.92
+_CANDIDATES = 3
+UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
+BUILTIN_PLAN = Plan(steps=6000, look_every=200)
 
 Progress = Callable[[str, int, int], None]
 
@@ -39,15 +39,20 @@ class Halves:
     report: Sequence[LabelledImage]
 
 
+def choosing(images: StoredImages) -> list[int]:
+    """Return the pictures of the first half of the scenes; names start with a scene's number."""
+    scenes = [name.split("-")[0] for name in images.names]
+    first = set(sorted(set(scenes))[: len(set(scenes)) // 2])
+    return [number for number, scene in enumerate(scenes) if scene in first]
+
+
 def halves_of(images: StoredImages) -> Halves:
-    """Split by scene, not by picture: the names start with the scene's number."""
-    own = [(name, without_small(images[k])) for k, name in enumerate(images.names)]
-    scenes = sorted({name.split("-")[0] for name, _ in own})
-    first = set(scenes[: len(scenes) // 2])
-    return Halves(
-        choose=[image for name, image in own if name.split("-")[0] in first],
-        report=[image for name, image in own if name.split("-")[0] not in first],
-    )
+    """Split a set by scene, not by picture."""
+    first = set(choosing(images))
+    halves: tuple[list[LabelledImage], list[LabelledImage]] = ([], [])
+    for number in range(len(images)):
+        halves[number not in first].append(without_small(images[number]))
+    return Halves(choose=halves[0], report=halves[1])
 
 
 def builtin_weights(
@@ -62,32 +67,28 @@ def builtin_weights(
     run = resume(plan, folder / "run") or start(plan)
     validate = StoredImages(folder / "data" / "validate")
     pictures = StoredImages(folder / "data" / "train")
-    train(run, lambda: pictures, folder / "run", Look(validate, halves_of_names(validate)))
+    look = Look(validate, choosing(validate)[::2])
+
+    def looked(network: UNet) -> dict[str, float]:
+        progress("steps", run.step, plan.steps)
+        return look(network)
+
+    train(run, lambda: pictures, folder / "run", looked)
     model, facts = finish(run, folder / "run", halves_of(validate))
     facts["training"] |= {"pictures": len(pictures), "data": digest(pictures)}
     save(output, model, facts)
     return facts
 
 
-def halves_of_names(images: StoredImages) -> list[int]:
-    """Return the pictures of the choosing half that are looked at during training."""
-    scenes = sorted({name.split("-")[0] for name in images.names})
-    first = set(scenes[: len(scenes) // 2])
-    chosen = [k for k, name in enumerate(images.names) if name.split("-")[0] in first]
-    return chosen[::2]
-
-
 def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any]]:
-    """Choose among the last averages of a run by line-AP, calibrate, and measure.
+    """Choose among the averages that looked best by line-AP, calibrate, and measure.
 
     Raises:
         UsageError: the folder holds no averaged weights.
     """
-    paths = sorted(folder.glob("average-*.pt"))[-_CANDIDATES:]
-    if not paths:
-        raise UsageError(f"{folder}: holds no averaged weights; train first")
-    candidates = [_candidate(path, run.plan.channels, halves.choose) for path in paths]
-    model, chosen = max(candidates, key=lambda pair: figures(pair[1], 0.0)["line_ap"])
+    paths = _promising(folder)
+    candidates = [(path, *_candidate(path, run.plan.channels, halves.choose)) for path in paths]
+    chosen_path, model, chosen = max(candidates, key=lambda c: _line_ap(c[2]))
     calibration = calibrated(chosen)
     least = threshold([s.judged for s in _scored(chosen, calibration)], WANTED_PRECISION)
     model = replace(model, calibration=calibration, least_score=least)
@@ -100,12 +101,23 @@ def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any
         "training": {
             "plan": asdict(run.plan),
             "steps": run.step,
+            "chosen": chosen_path.name,
             "minutes": round(run.seconds / 60, 1),
             "torch": torch.__version__,
             "machine": platform.processor() or platform.machine(),
         },
     }
     return model, facts
+
+
+def _promising(folder: Path) -> list[Path]:
+    """Return the averages that looked best during training."""
+    try:
+        log = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    except OSError as error:
+        raise UsageError(f"{folder}: holds no training log; train first") from error
+    best = sorted(log, key=lambda entry: -float(entry["val_iou"]))[:_CANDIDATES]
+    return [folder / f"average-{entry['step']:06d}.pt" for entry in best]
 
 
 def _candidate(
@@ -144,6 +156,10 @@ def _scored(sightings: Sequence[Sighting], calibration: Calibration) -> list[Sig
     ]
 
 
+def _line_ap(sightings: Sequence[Sighting]) -> float:
+    return figures(_scored(sightings, calibrated(sightings)), 0.0)["line_ap"]
+
+
 def _rounded(values: dict[str, float]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in values.items()}
 
@@ -153,6 +169,6 @@ def digest(images: StoredImages) -> str:
     total = hashlib.sha256()
     for k, name in enumerate(images.names):
         total.update(name.encode())
-        total.update(np.ascontiguousarray(images.color(k)))
-        total.update(np.ascontiguousarray(images.maps(k)))
+        total.update(images.color(k).tobytes())
+        total.update(images.maps(k).tobytes())
     return total.hexdigest()

@@ -1,5 +1,7 @@
 """Drawn branches: pictures, masks and lines whose truth is known exactly."""
 
+import itertools
+
 import numpy as np
 
 from canopy_skel.segmenters.labels import LabelledImage
@@ -23,7 +25,7 @@ def cover(line, size):
     """The (H, W) pixels whose centres lie within the radius of a line, with square ends."""
     v, u = np.mgrid[: size[0], : size[1]]
     inside = np.zeros(size, bool)
-    for a, b in zip(line, line[1:], strict=False):
+    for a, b in itertools.pairwise(line):
         length = np.linalg.norm((b - a)[:2])
         c, s = (b - a)[:2] / length
         along = c * (u - a[0]) + s * (v - a[1])

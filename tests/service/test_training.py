@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,11 +7,12 @@ import torch
 from scenes.drawn import drawn, straight
 
 from canopy_skel.errors import UsageError
+from canopy_skel.metrics.instances import Judged, calibration_error
 from canopy_skel.segmenters.unet.weights import load
-from service.training import loop
+from service.training import builtin, loop
 from service.training.builtin import Amounts
 from service.training.crops import draw_batch
-from service.training.judging import calibrated
+from service.training.judging import Sighting, calibrated
 from service.training.loop import Plan, resume, start, train
 from service.training.recipe import builtin_weights
 from service.training.store import StoredImages, store
@@ -81,18 +83,17 @@ def test_the_loss_falls_and_a_broken_off_run_ends_as_an_unbroken_one(images, tmp
     assert log[-1]["branch"] < log[0]["branch"]
 
     first = start(TINY)
-    first.plan = Plan(**{**loop.asdict(TINY)})
     part = tmp_path / "part"
 
-    class Stop(Exception):
+    class StopError(Exception):
         pass
 
     def stop(network):
         if first.step == 10:
-            raise Stop
+            raise StopError
         return {}
 
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         train(first, lambda: images, part, stop)
     again = resume(TINY, part)
     assert again.step == 5
@@ -118,3 +119,43 @@ def test_a_run_of_another_plan_is_not_gone_on_with(images, tmp_path):
 def test_without_pictures_there_is_no_training(tmp_path):
     with pytest.raises(UsageError, match="no pictures to train on"):
         train(start(TINY), lambda: StoredImages(tmp_path), tmp_path, lambda network: {})
+
+
+def test_the_recipe_goes_from_nothing_to_weights_and_on_where_it_was(tmp_path, monkeypatch):
+    for name in ("TRAIN", "VALIDATE"):
+        variety = replace(getattr(builtin, name), width_px=256, height_px=192)
+        monkeypatch.setattr(builtin, name, variety)
+    plan = replace(TINY, steps=10, channels=(4, 6, 8, 8, 8))
+    amounts = Amounts(train_scenes=1, validate_scenes=2)
+    seen = []
+
+    def progress(name, done, total):
+        seen.append((name, done, total))
+
+    path = tmp_path / "unet.pt"
+    facts = builtin_weights(tmp_path, path, plan, amounts, progress)
+    assert seen[:3] == [("validate", 1, 2), ("validate", 2, 2), ("train", 1, 1)]
+    assert facts["training"]["steps"] == 10
+    assert facts["training"]["pictures"] == 4
+    assert facts["validation"]["reported"].keys() >= {"line_ap", "precision", "pixel_iou"}
+    assert load(path).channels == plan.channels
+    log = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
+    again = builtin_weights(tmp_path, path, replace(plan, steps=15), amounts, progress)
+    assert again["training"]["steps"] == 15
+    assert again["training"]["data"] == facts["training"]["data"]
+    assert (tmp_path / "run" / "log.jsonl").read_text().splitlines()[: len(log)] == log
+
+
+def test_calibrated_scores_are_the_share_that_is_real():
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(4000, 3)) * [1, 10, 0.1] + [5, 0, 0]
+    real = rng.random(4000) < 1 / (1 + np.exp(-(2 * (features[:, 0] - 5) + 0.1 * features[:, 1])))
+    scores = np.zeros(4000)
+    judged = Judged(
+        scores=scores, found=real, real=real, number=np.arange(4000), matched=np.zeros(0, bool)
+    )
+    nothing = np.zeros(2, np.int64)
+    sighting = Sighting(judged=judged, features=features, common=nothing, either=nothing)
+    calibration = calibrated([sighting])
+    assert calibration_error(calibration.scores(features), real) < 0.03
+    assert calibration.weights[:2] == pytest.approx((2, 0.1), rel=0.15)

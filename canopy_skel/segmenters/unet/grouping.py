@@ -13,10 +13,12 @@ from scipy.special import expit
 from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray
 from canopy_skel.kernels import strands
+from canopy_skel.segmenters.unet.features import measured
+from canopy_skel.segmenters.unet.joining import joined
 from canopy_skel.segmenters.unet.targets import STRIDE
 
 _TRIES = 5
-FEATURES = ("branch", "centre", "direction", "fill", "log_length", "log_radius")
+_SLENDER = 1.2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -29,8 +31,8 @@ class Grouping:
     middle.
     """
 
-    branch: float = 0.3
-    centre: float = 0.05
+    branch: float = 0.4
+    centre: float = 0.15
     gate_deg: float = 14.0
     ratio: float = 0.6
     bend_px: float = 2.0
@@ -45,10 +47,8 @@ class Grouping:
 class Strands:
     """Instances on the network's grid.
 
-    label: (h, w) int32, 0 = none. features: (N, len(FEATURES)) of instance i at i - 1: mean
-    probabilities of branch and middle line, agreement of direction, area over that of a strip of
-    the length and radius, logarithms of length and radius in pixels. surplus: (h, w), how far
-    the branch logit is above the threshold.
+    label: (h, w) int32, 0 = none. surplus: (h, w), how far the branch logit is above the threshold.
+    features: (N, F) of instance i at i - 1, see `features`.
     """
 
     label: strands.I32
@@ -73,75 +73,38 @@ def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
     order, starts = strands.chains(strands.links(number, cells, field, gate, _TRIES))
     cells = cells[order]
     rule = np.array([grouping.bend_px / STRIDE, grouping.bend_share, grouping.bend_radii])
-    least = 0.6 * grouping.least_length_px / STRIDE
+    least = 0.4 * grouping.least_length_px / STRIDE
     pieces = strands.straight_pieces(cells, starts, field[2], rule, least)
-    longest_first = np.argsort(pieces[:, 0] - pieces[:, 1], kind="stable")
+    paths = joined([cells[begin:end] for begin, end in pieces], field[2], rule)
+    paths.sort(key=len, reverse=True)
+    ends = np.cumsum([0, *map(len, paths)])
     label = np.empty(inside.shape, dtype=np.int32)
-    count = strands.painted(cells, pieces[longest_first], field[2], label)
+    together = np.concatenate([np.empty((0, 2), np.int32), *paths])
+    count = strands.painted(together, np.stack([ends[:-1], ends[1:]], axis=1), field[2], label)
+    middle = label.copy()
     strands.grown(label, inside, field[2], grouping.reach)
-    return _kept(label, count, maps, field[2], grouping)
+    measures = measured(label, middle, count, maps, field[2])
+    wanted = measures.pixels >= grouping.least_pixels
+    wanted &= measures.length_px >= grouping.least_length_px
+    wanted &= measures.length_px**2 > _SLENDER * measures.pixels
+    kept = np.zeros(count + 1, dtype=np.int32)
+    kept[1:][wanted] = np.arange(1, int(wanted.sum()) + 1)
+    return Strands(
+        label=kept[label],
+        surplus=maps[0] - np.float32(_logit(grouping.branch)),
+        features=measures.features[wanted],
+    )
 
 
 def _logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
 
 
-def _kept(
-    label: strands.I32, count: int, maps: Float32Array, log_radius: Float32Array, grouping: Grouping
-) -> Strands:
-    """Measure the strands and keep those large enough."""
-    rows, columns = np.nonzero(label)
-    own = label[rows, columns] - 1
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.bincount(own, values, count) / cells
-
-    cells = np.maximum(np.bincount(own, minlength=count), 1)
-    length = STRIDE * _lengths(rows, columns, own, cells)
-    radius = STRIDE * np.exp(mean(log_radius[rows, columns]))
-    pixels = STRIDE**2 * cells
-    wanted = (pixels >= grouping.least_pixels) & (length >= grouping.least_length_px)
-    wanted &= length > 1.2 * pixels / length
-    features = np.column_stack(
-        [
-            mean(expit(maps[0, rows, columns])),
-            mean(expit(maps[1, rows, columns])),
-            np.hypot(mean(maps[2, rows, columns]), mean(maps[3, rows, columns])),
-            np.minimum(pixels / (2 * radius * length), 2.0),
-            np.log(np.maximum(length, 1.0)),
-            np.log(radius),
-        ]
-    )
-    number = np.zeros(count + 1, dtype=np.int32)
-    number[1:][wanted] = np.arange(1, int(wanted.sum()) + 1)
-    return Strands(
-        label=number[label],
-        surplus=maps[0] - np.float32(_logit(grouping.branch)),
-        features=features[wanted],
-    )
-
-
-def _lengths(
-    rows: np.ndarray, columns: np.ndarray, own: np.ndarray, cells: np.ndarray
-) -> FloatArray:
-    """Return the (N,) lengths of strands in cells: that of a strip with the same second moment."""
-    u, v = columns.astype(np.float64), rows.astype(np.float64)
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.bincount(own, values, len(cells)) / cells
-
-    centre_u, centre_v = mean(u)[own], mean(v)[own]
-    uu, vv = mean((u - centre_u) ** 2), mean((v - centre_v) ** 2)
-    uv = mean((u - centre_u) * (v - centre_v))
-    largest = 0.5 * (uu + vv) + np.sqrt(0.25 * (uu - vv) ** 2 + uv**2)
-    return np.asarray(np.sqrt(12 * largest + 1))
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Calibration:
     """From features to the probability that an instance is a branch: a logistic regression.
 
-    weights: one per name of `FEATURES`.
+    weights: one per name of `features.FEATURES`.
     """
 
     weights: tuple[float, ...]

@@ -3,6 +3,7 @@
 Five maps at half size: branch, middle line (both logits), cos 2θ, sin 2θ, log radius.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -58,7 +59,7 @@ class UNet(nn.Module):
 
     def __init__(self, channels: Sequence[int] = CHANNELS) -> None:
         super().__init__()
-        pairs = list(zip(channels, channels[1:], strict=False))
+        pairs = list(itertools.pairwise(channels))
         self.stem = _convolution(3, channels[0], size=5, stride=2)
         self.down = nn.ModuleList(_convolution(a, b, stride=2) for a, b in pairs)
         self.encode = nn.ModuleList(_Residual(c) for c in channels[1:])
@@ -78,6 +79,14 @@ class UNet(nn.Module):
             x = self.decode[level](up + skips[level])
         result: Tensor = self.head(x)
         return result
+
+
+def channels_last(network: UNet) -> UNet:
+    """Lay the weights out as CPUs like them best, in place."""
+    for parameter in network.parameters():
+        if parameter.dim() == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return network
 
 
 def maps_of(output: Tensor) -> Maps:

@@ -13,7 +13,7 @@ from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.unet.grouping import Strands, grouped
-from canopy_skel.segmenters.unet.network import MULTIPLE_PX, normalised
+from canopy_skel.segmenters.unet.network import MULTIPLE_PX, channels_last, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.targets import STRIDE
 from canopy_skel.segmenters.unet.weights import Model, fused
@@ -53,7 +53,7 @@ class UNetSegmenter:
         torch.set_num_threads(threads)
         self._model = model
         network = fused(copy.deepcopy(model.network).eval())
-        self._network = network.to(device, memory_format=torch.channels_last)
+        self._network = channels_last(network).to(device)
         self._device, self._bfloat16, self._tile_px = device, bfloat16, tile_px
 
     def segment(self, view: View) -> Sequence[BranchMask]:

@@ -34,8 +34,8 @@ class Target(IntEnum):
 def targets_of(image: LabelledImage) -> UInt8Array:
     """Return (H / 2, W / 2, 4) bytes: STATE, CENTRE (0 or 1), ANGLE, RADIUS.
 
-    A cell belongs to a branch, or is ignored, when half of its pixels are. The centre band is the inner third of a
-    branch, three pixels at least.
+    A cell belongs to a branch, or is ignored, when half of its pixels are. The centre band is the
+    inner third of a branch, three pixels at least.
     """
     instances, ignored = _halved(image)
     states = np.where(ignored >= 0.5, Target.IGNORE, Target.NONE)

@@ -12,7 +12,8 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from canopy_skel.errors import UsageError
-from canopy_skel.segmenters.unet.grouping import FEATURES, Calibration, Grouping
+from canopy_skel.segmenters.unet.features import FEATURES
+from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.weight_files import (
     read_description,
@@ -87,7 +88,10 @@ def load(path: Path = BUILTIN) -> Model:
 def fused(network: UNet) -> UNet:
     """Fold batch normalisation into the convolutions before it, in place; for inference only."""
     for module in list(network.modules()):
-        if isinstance(module, nn.Sequential) and isinstance(module[1], nn.BatchNorm2d):
-            module[0] = fuse_conv_bn_eval(module[0], module[1])
+        if not isinstance(module, nn.Sequential):
+            continue
+        convolution, normalisation = module[0], module[1]
+        if isinstance(convolution, nn.Conv2d) and isinstance(normalisation, nn.BatchNorm2d):
+            module[0] = fuse_conv_bn_eval(convolution, normalisation)
             module[1] = nn.Identity()
     return network

@@ -44,7 +44,9 @@ def clouds(rng: np.random.Generator, size: Size, cells: float, octaves: int = 4)
     return np.asarray(total / weight, dtype=np.float32)
 
 
-def _two_tone(rng: np.random.Generator, size: Size, low: FloatArray, high: FloatArray) -> Float32Array:
+def _two_tone(
+    rng: np.random.Generator, size: Size, low: FloatArray, high: FloatArray
+) -> Float32Array:
     mix = np.clip(1.8 * (clouds(rng, size, rng.uniform(2, 30)) - 0.5) + 0.5, 0, 1)[..., None]
     grain = 1 + rng.uniform(0.1, 0.9) * (clouds(rng, size, rng.uniform(60, 300)) - 0.5)
     return np.asarray((low + mix * (high - low)) * grain[..., None], dtype=np.float32)
@@ -73,7 +75,9 @@ def sky(rng: np.random.Generator, size: Size) -> Float32Array:
     return np.asarray(picture + cloud[..., None] * (white - picture), dtype=np.float32)
 
 
-def _strokes(rng: np.random.Generator, size: Size, count: int, widths: tuple[float, float]) -> Layer:
+def _strokes(
+    rng: np.random.Generator, size: Size, count: int, widths: tuple[float, float]
+) -> Layer:
     """Return crooked strokes like thin trunks, limbs and twigs, each of one colour."""
     rgb, alpha = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
     upright = rng.random() < 0.6
@@ -99,11 +103,13 @@ def _softened(layer: Layer, sigma_px: float) -> Layer:
         return layer
     alpha = cv2.GaussianBlur(layer.alpha, (0, 0), sigma_px)
     rgb = cv2.GaussianBlur(layer.rgb * layer.alpha[..., None], (0, 0), sigma_px)
-    rgb /= np.maximum(alpha, 1e-4)[..., None]
+    rgb = rgb / np.maximum(alpha, 1e-4)[..., None]
     return Layer(rgb=np.asarray(rgb, np.float32), alpha=np.asarray(alpha, np.float32))
 
 
-def _leaves(rng: np.random.Generator, size: Size, count: int, lengths: tuple[float, float]) -> Layer:
+def _leaves(
+    rng: np.random.Generator, size: Size, count: int, lengths: tuple[float, float]
+) -> Layer:
     """Return leaves as pointed ovals in greens."""
     rgb, alpha = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
     turn = np.linspace(0, 2 * np.pi, 14)

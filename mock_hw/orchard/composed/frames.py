@@ -142,7 +142,7 @@ def _photograph(linear: Float32Array, scene: Scene, rng: np.random.Generator) ->
     if rng.random() < 0.6:
         quality = int(rng.integers(35, 97))
         data = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        color = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], dtype=np.uint8)
+        color = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)[..., ::-1]
     return np.ascontiguousarray(color)
 
 
@@ -152,6 +152,9 @@ def _shaken(color: UInt8Array, rng: np.random.Generator) -> UInt8Array:
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
     angle = rng.uniform(0, np.pi)
     tip = np.rint(reach * np.array([np.cos(angle), np.sin(angle)])).astype(int)
-    start, end = (int(reach - tip[0]), int(reach - tip[1])), (int(reach + tip[0]), int(reach + tip[1]))
+    start, end = (
+        (int(reach - tip[0]), int(reach - tip[1])),
+        (int(reach + tip[0]), int(reach + tip[1])),
+    )
     cv2.line(kernel, start, end, 1.0)
     return np.asarray(cv2.filter2D(color, -1, kernel / kernel.sum())).astype(np.uint8)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from canopy_skel.frame import Intrinsics, UInt16Array
-from canopy_skel.geometry import BoolArray, FloatArray, invert, transform_points
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray, invert, transform_points
 from mock_hw.orchard.kernels.components import components
 from mock_hw.orchard.mesh import Int32Array
 from mock_hw.orchard.tree import Tree
@@ -13,6 +13,8 @@ from mock_hw.orchard.tree import Tree
 LEAST_PIXELS = 120
 LEAST_LENGTH_PX = 25.0
 LEAST_WIDTH_PX = 2.3
+BRIDGE_PX = 8.0
+"""A branch goes on behind what hides less of it than this: a wire, a petiole, a leaf's edge."""
 BEND_SHARE = 0.08
 _BEND_PX = 2.0
 _BEND_RADII = 0.5
@@ -32,22 +34,15 @@ def labels_in(
 ) -> Labels:
     """Label an image of skeleton vertices (H, W; -1 = no wood).
 
-    What shows of a branch as connected pixels is cut where its line leaves the chord by more
-    than a share of its length (8 % is a bend of 18 degrees in the middle).
+    What shows of a branch is cut where its line leaves the chord by more than a share of its
+    length (8 % is a bend of 18 degrees in the middle).
     """
     uvr = _projected(tree, base_from_camera, intrinsics)
-    seen = vertex >= 0
-    region = np.empty(vertex.shape, dtype=np.int32)
-    components(np.where(seen, tree.branch[vertex], -1).astype(np.int32), region)
-    pixels = np.flatnonzero(seen)
-    pixels = pixels[np.argsort(region.ravel()[pixels], kind="stable")]
-    starts = np.flatnonzero(np.diff(region.ravel()[pixels], prepend=-1))
     instances = np.zeros(vertex.size, dtype=np.uint16)
     lines: list[FloatArray] = []
-    for own in np.split(pixels, starts[1:]):
-        if len(own) < LEAST_PIXELS:
-            continue
-        shown = vertex.ravel()[own]
+    flat = vertex.ravel()
+    for own in _visible_stretches(vertex, tree, uvr):
+        shown = flat[own]
         low, high = int(shown.min()), int(shown.max())
         for first, last in _straight(uvr[low : high + 1]):
             line = uvr[low + first : low + last + 1]
@@ -56,14 +51,42 @@ def labels_in(
                 lines.append(line)
                 instances[mine] = len(lines)
     image = instances.reshape(vertex.shape)
-    return Labels(instances=image, lines=tuple(lines), ignore=seen & (image == 0))
+    return Labels(instances=image, lines=tuple(lines), ignore=(vertex >= 0) & (image == 0))
+
+
+def _visible_stretches(vertex: Int32Array, tree: Tree, uvr: FloatArray) -> list[IntArray]:
+    """Return the pixels of each stretch of a branch that shows, gaps of a few pixels bridged."""
+    seen = vertex >= 0
+    region = np.empty(vertex.shape, dtype=np.int32)
+    count = components(np.where(seen, tree.branch[vertex], -1).astype(np.int32), region)
+    flat, pixels = vertex.ravel(), np.flatnonzero(seen)
+    home = region.ravel()[pixels]
+    low, high = np.full(count, len(tree.branch)), np.full(count, -1)
+    np.minimum.at(low, home, flat[pixels])
+    np.maximum.at(high, home, flat[pixels])
+    stretch = np.empty(count, dtype=np.int64)
+    reached = own = -1
+    for part in np.lexsort([low, tree.branch[low]]):
+        gap = np.linalg.norm(uvr[low[part], :2] - uvr[reached, :2])
+        goes_on = tree.branch[low[part]] == tree.branch[reached] and gap <= BRIDGE_PX
+        if own < 0 or not (goes_on or low[part] <= reached):
+            own, reached = part, -1
+        stretch[part] = own
+        reached = max(reached, int(high[part]))
+    home = stretch[home].astype(np.int32)
+    order = np.argsort(home, kind="stable")
+    starts = np.flatnonzero(np.diff(home[order], prepend=-1))
+    stretches = np.split(pixels[order], starts[1:])
+    return [stretch for stretch in stretches if len(stretch) >= LEAST_PIXELS]
 
 
 def _findable(line: FloatArray, pixels: int) -> bool:
     length = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
     width = pixels / max(length, 1e-9)
     slender = length > 1.2 * width
-    return pixels >= LEAST_PIXELS and length >= LEAST_LENGTH_PX and width >= LEAST_WIDTH_PX and slender
+    return (
+        pixels >= LEAST_PIXELS and length >= LEAST_LENGTH_PX and width >= LEAST_WIDTH_PX and slender
+    )
 
 
 def _projected(tree: Tree, base_from_camera: FloatArray, intrinsics: Intrinsics) -> FloatArray:
@@ -102,4 +125,3 @@ def _bend(uvr: FloatArray) -> int | None:
     allowed = max(_BEND_PX, BEND_SHARE * length, _BEND_RADII * float(uvr[:, 2].mean()))
     ends = min(worst, len(uvr) - 1 - worst)
     return worst if offset[worst] > allowed and ends >= 2 else None
-

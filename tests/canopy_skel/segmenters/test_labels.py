@@ -21,9 +21,7 @@ def angle_apart_deg(a, b):
     return abs((a - b + 90) % 180 - 90)
 
 
-@given(
-    angle=st.floats(0, 180), length=st.floats(60, 180), radius=st.floats(2.5, 9)
-)
+@given(angle=st.floats(0, 180), length=st.floats(60, 180), radius=st.floats(2.5, 9))
 def test_the_middle_line_of_a_bar_is_its_axis(angle, length, radius):
     line = straight((160, 120), angle, length, radius)
     found = line_of_mask(cover(line, (240, 320)))

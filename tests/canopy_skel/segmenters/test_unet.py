@@ -11,11 +11,12 @@ from scenes.views import view_of
 
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.segmenters.unet import segmenter as module
+from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
-from canopy_skel.segmenters.unet.weights import BUILTIN, Model, load
+from canopy_skel.segmenters.unet.weights import Model, load
 
 TORCH_FREE = """
 import sys
@@ -36,7 +37,7 @@ def untrained():
         network=UNet(channels).eval(),
         channels=channels,
         grouping=Grouping(),
-        calibration=Calibration(weights=(0.0,) * 6, bias=0.0),
+        calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=0.0),
         least_score=0.0,
     )
 
@@ -45,11 +46,15 @@ def noise(height, width):
     return np.random.default_rng(1).integers(0, 256, (height, width, 3)).astype(np.uint8)
 
 
-@pytest.mark.skipif(not BUILTIN.exists(), reason="the built-in weights are not there")
+@pytest.fixture(scope="module")
+def builtin():
+    return UNetSegmenter(load())
+
+
 class TestUNetSegmenter(SegmenterContract):
-    @pytest.fixture(scope="class")
-    def segmenter(self):
-        return UNetSegmenter(load())
+    @pytest.fixture
+    def segmenter(self, builtin):
+        return builtin
 
     @pytest.fixture
     def view_with_branches(self):
@@ -119,9 +124,7 @@ def test_other_errors_are_not_taken_for_lack_of_memory(untrained, monkeypatch):
         UNetSegmenter(untrained).maps(noise(60, 80))
 
 
-@pytest.mark.parametrize(
-    "color", [np.zeros((40, 60, 3), np.uint16), np.zeros((40, 60), np.uint8)]
-)
+@pytest.mark.parametrize("color", [np.zeros((40, 60, 3), np.uint16), np.zeros((40, 60), np.uint8)])
 def test_pictures_that_are_not_8_bit_colour_are_refused(untrained, color):
     with pytest.raises(ViewError, match=r"needs \(H, W, 3\) uint8"):
         UNetSegmenter(untrained).segment(view_of(color))

@@ -123,7 +123,6 @@ def test_the_network_answers_at_half_size():
     assert out.shape == (1, 5, 32, 48)
 
 
-@pytest.mark.skipif(not BUILTIN.exists(), reason="the built-in weights are not there")
 def test_the_built_in_weights_are_small_and_say_where_they_come_from():
     assert BUILTIN.stat().st_size <= 8 << 20
     assert sum(value.numel() for value in load().network.parameters()) <= 3_000_000

@@ -1,0 +1,218 @@
+"""Curves, picture sheet and figures of the built-in weights, from the folder they were trained in.
+
+python benchmarks/segmentation.py FOLDER ../shared/data/recordings --output DIR
+"""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from time import process_time
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+
+from canopy_skel.recording import read_recording
+from canopy_skel.segmenters.unet.grouping import grouped
+from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+from canopy_skel.segmenters.unet.weights import BUILTIN, load
+from service.training.recipe import halves_of
+from service.training.store import StoredImages
+
+CANOPY = Path(sys.executable).with_name("canopy")
+RECORDINGS = ("apple_fd2", "oak_fd3", "apple_dense", "walnut_stereo")
+SHOWN = (
+    "line_ap",
+    "precision",
+    "recall",
+    "pixel_iou",
+    "pixel_iou_reported",
+    "calibration_error",
+    "instances",
+)
+TILE = (480, 360)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="where `canopy train` has worked")
+    parser.add_argument("recordings", type=Path)
+    parser.add_argument("--output", type=Path, required=True)
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    log = arguments.folder / "run" / "log.jsonl"
+    shutil.copy(log, arguments.output / "log.jsonl")
+    curves(log, arguments.output / "curves.png")
+    validate = halves_of(StoredImages(arguments.folder / "data" / "validate"))
+    sheet(validate.report, arguments.output / "sheet.jpg")
+    rows = [end_to_end(arguments.recordings / f"{name}.mcap") for name in RECORDINGS]
+    (arguments.output / "README.md").write_text(page(rows, speed()))
+
+
+def curves(log, path):
+    entries = [json.loads(line) for line in log.read_text().splitlines()]
+    steps = [entry["step"] for entry in entries]
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
+    for axis, names, title in (
+        (axes[0], ("branch", "centre", "direction", "radius"), "training loss, smoothed"),
+        (axes[1], ("val_iou", "val_centre_iou"), "validation of another kind, cells"),
+        (axes[2], ("val_angle_median", "val_angle_p90"), "error of direction, degrees"),
+    ):
+        for name in names:
+            axis.plot(steps, [entry[name] for entry in entries], label=name)
+        axis.set_title(title)
+        axis.set_xlabel("step (8 crops)")
+        axis.legend()
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def sheet(images, path):
+    """Pictures of the reporting half: as seen, as labelled, as found."""
+    segmenter = UNetSegmenter(load())
+    chosen = sorted(range(len(images)), key=lambda k: -len(images[k].lines))[::5][:8]
+    rows = []
+    for number in chosen:
+        image = images[number]
+        label = np.zeros(image.ignore.shape, np.int64)
+        for k, mask in enumerate(found_in(segmenter, image.color_rgb), start=1):
+            height, width = mask.mask.shape
+            part = label[mask.top_px : mask.top_px + height, mask.left_px : mask.left_px + width]
+            part[mask.mask] = k
+        tiles = [image.color_rgb, coloured(image.instances, image.ignore), coloured(label, None)]
+        rows.append(np.hstack([cv2.resize(t, TILE, interpolation=cv2.INTER_AREA) for t in tiles]))
+    halves = [np.vstack(rows[: len(rows) // 2]), np.vstack(rows[len(rows) // 2 :])]
+    picture = np.ascontiguousarray(np.hstack(halves)[..., ::-1])
+    cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 78])
+
+
+def found_in(segmenter, color_rgb):
+    from canopy_skel.frame import Intrinsics, View
+
+    height, width = color_rgb.shape[:2]
+    lens = Intrinsics(fx_px=1, fy_px=1, cx_px=0, cy_px=0, width_px=width, height_px=height)
+    pose = np.eye(4)
+    return segmenter.segment(
+        View(index=0, stamp_ns=0, color_rgb=color_rgb, intrinsics=lens, base_from_camera=pose)
+    )
+
+
+def coloured(label, ignore):
+    palette = np.random.default_rng(1).integers(70, 256, (int(label.max()) + 1, 3))
+    palette[0] = 0
+    picture = palette[label].astype(np.uint8)
+    if ignore is not None:
+        picture[ignore] = 90
+    return picture
+
+
+def end_to_end(recording):
+    scores = {}
+    for segmenter in ("recorded", "unet"):
+        with tempfile.TemporaryDirectory() as out:
+            skeleton = Path(out) / f"{recording.stem}.skeleton.json"
+            options = f"--segmenter {segmenter} --formats json"
+            os.popen(f"{CANOPY} replay {recording} -o {out} {options} --json").read()
+            scores[segmenter] = json.loads(
+                os.popen(f"{CANOPY} score {skeleton} {recording} --json").read()
+            )
+    return recording.stem, scores
+
+
+def speed():
+    """CPU seconds of one 1440 x 1080 picture on one thread: float32, bfloat16, grouping."""
+    path = next(Path(__file__).parents[1].glob("recordings/*.mcap"))
+    color = next(iter(read_recording(path).views())).color_rgb
+    picture = cv2.resize(np.array(color), (1440, 1080))
+    model = load()
+    seconds = {}
+    for name, bfloat16 in (("float32", False), ("bfloat16", True)):
+        if bfloat16 and not has_fast_bfloat16():
+            continue
+        segmenter = UNetSegmenter(model, bfloat16=bfloat16)
+        maps, seconds[name] = timed(segmenter.maps, picture)
+    _, seconds["grouping"] = timed(grouped, maps, model.grouping)
+    return seconds
+
+
+def timed(function, *arguments):
+    best = np.inf
+    for _ in range(4):
+        start = process_time()
+        result = function(*arguments)
+        best = min(best, process_time() - start)
+    return result, best
+
+
+def cpu_model():
+    names = [
+        line for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line
+    ]
+    return names[0].split(":")[1].strip() if names else "unknown"
+
+
+def page(rows, seconds):
+    facts = json.loads(BUILTIN.with_suffix(".json").read_text())
+    training, validation = facts["training"], facts["validation"]
+    lines = [
+        "# The built-in weights of the unet segmenter, measured",
+        "",
+        "Made by `benchmarks/segmentation.py`. Every picture is synthetic: nothing here says how"
+        " the segmenter does in an orchard.",
+        "",
+        f"Trained for {training['steps']} steps of {training['plan']['batch']} crops"
+        f" ({training['minutes']:g} minutes of wall time on a shared core, "
+        f"{training['pictures']} pictures). [log.jsonl](log.jsonl); ![curves](curves.png)",
+        "",
+        "## Validation of another kind",
+        "",
+        f"{validation['kind'].capitalize()}. Checkpoint, calibration and threshold"
+        f" ({facts['least_score']}) were chosen on one half of the scenes, the other half reports."
+        " What each figure means: [segmentation.md](../../segmentation.md).",
+        "",
+        "| half | " + " | ".join(SHOWN) + " |",
+        "|---|" + "---|" * len(SHOWN),
+        *(
+            f"| {name} | " + " | ".join(f"{validation[half][key]:g}" for key in SHOWN) + " |"
+            for name, half in (("chosen on", "chosen_on"), ("**reported**", "reported"))
+        ),
+        "",
+        "Seen, labelled (grey: too small), found:",
+        "![Pictures of the reporting half in three columns](sheet.jpg)",
+        "",
+        "## End to end, on recordings of another generator",
+        "",
+        "Skeletons from learned masks beside those from the recorded (true) masks, method `paper`.",
+        "",
+        "| recording | P recorded | P unet | ratio | R recorded | R unet | ratio | OSR recorded"
+        " | OSR unet |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, scores in rows:
+        true, mine = scores["recorded"], scores["unet"]
+        cells = []
+        for key in ("precision", "recall"):
+            cells += [true[key], mine[key], mine[key] / true[key]]
+        cells += [true["osr"], mine["osr"]]
+        lines.append(f"| {name} | " + " | ".join(f"{value:.3f}" for value in cells) + " |")
+    lines += [
+        "",
+        "## Time",
+        "",
+        f"CPU seconds of one 1440 x 1080 picture, one thread, {cpu_model()}: "
+        + ", ".join(f"{name} {value:.3f}" for name, value in seconds.items())
+        + ".",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

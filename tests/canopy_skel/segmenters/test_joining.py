@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from canopy_skel.segmenters.unet.joining import joined
+
+RULE = np.array([1.0, 0.1, 0.5])
+LOG_RADIUS = np.full((60, 120), np.log(2.0), dtype=np.float32)
+
+
+def path(start, step, count):
+    """Cells (row, column) from `start` on by `step`."""
+    return (np.array(start) + np.arange(count)[:, None] * np.array(step)).astype(np.int32)
+
+
+def cells_of(paths):
+    return sorted(len(p) for p in paths)
+
+
+@pytest.mark.parametrize("gap", [1, 3, 6])
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_goes_on_straight_is_one(gap, turned):
+    first, second = path((30, 10), (0, 1), 30), path((30, 39 + gap), (0, 1), 30)
+    (one,) = joined([first, second[::-1] if turned else second], LOG_RADIUS, RULE)
+    assert len(one) == 60
+    assert np.abs(np.diff(one[:, 1])).max() == gap
+    assert {tuple(one[0]), tuple(one[-1])} == {(30, 10), (30, 68 + gap)}
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        path((30, 54), (0, 1), 30),  # too far
+        path((36, 41), (0, 1), 30),  # aside
+        path((31, 40), (1, 1), 25),  # another direction
+        path((28, 20), (0, 1), 30),  # beside, not after
+    ],
+)
+def test_what_does_not_stays_two(second):
+    first = path((30, 10), (0, 1), 30)
+    assert cells_of(joined([first, second], LOG_RADIUS, RULE)) == cells_of([first, second])
+
+
+def test_at_a_fork_the_straighter_one_goes_on():
+    trunk = path((30, 10), (0, 1), 40)
+    on, off = path((30, 51), (0, 1), 40), np.array([(31 + k // 4, 51 + k) for k in range(40)])
+    found = joined([trunk, off.astype(np.int32), on], LOG_RADIUS, RULE)
+    assert cells_of(found) == [40, 80]
+    assert {tuple(p[-1]) for p in found} | {tuple(p[0]) for p in found} >= {(30, 10), (30, 90)}
+
+
+def test_pieces_of_unlike_width_are_not_one():
+    log_radius = LOG_RADIUS.copy()
+    log_radius[:, 40:] = np.log(6.0)
+    pieces = [path((30, 10), (0, 1), 30), path((30, 42), (0, 1), 30)]
+    assert len(joined(pieces, log_radius, RULE)) == 2
+
+
+def test_many_in_a_row_become_one_and_none_is_lost():
+    pieces = [path((30, 5 + 14 * k), (0, 1), 12) for k in range(7)]
+    (one,) = joined(pieces, LOG_RADIUS, RULE)
+    assert sorted(one[:, 1]) == sorted(np.concatenate(pieces)[:, 1])
+    assert joined([], LOG_RADIUS, RULE) == []
