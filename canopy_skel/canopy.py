@@ -228,7 +228,7 @@ def component_lengths(observed: Observed) -> tuple[IntArray, FloatArray]:
     total = np.bincount(
         component[edges[:, 0]], weights=of_edge, minlength=component.max(initial=-1) + 1
     )
-    return component.astype(np.int64), total[component]
+    return component.astype(np.int64), np.asarray(total, dtype=np.float64)[component]
 
 
 def chosen(observed: Observed, stay: BoolArray) -> Observed:

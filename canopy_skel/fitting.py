@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -59,8 +60,8 @@ def fit_models(lessons: Sequence[Lesson], provenance: str) -> Models:
         provenance=provenance,
     )
     for name, rows in _LATER.items():
-        model = _fit(lessons, lambda lesson, rows=rows, so_far=models: rows(lesson, so_far))
-        models = replace(models, **{name: model})
+        model = _fit(lessons, partial(_asked, rows, models))
+        models = replace(models, **{name: model})  # type: ignore[arg-type]  # names of models
     return models
 
 
@@ -83,6 +84,10 @@ def reliability(lesson: Lesson, models: Models) -> dict[str, float]:
 
 Rows = Callable[[Lesson, Models], tuple[FloatArray, BoolArray]]
 _CERTAIN = Logistic(bias=5.0, weights=(), means=(), scales=())
+
+
+def _asked(rows: Rows, models: Models, lesson: Lesson) -> tuple[FloatArray, BoolArray]:
+    return rows(lesson, models)
 
 
 def _fit(

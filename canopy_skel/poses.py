@@ -95,7 +95,7 @@ def _matches(
 ) -> tuple[IntArray, IntArray]:
     distance, index = tree.query(points, distance_upper_bound=config.reach_m)
     near = np.flatnonzero(np.isfinite(distance))
-    index = index[near].astype(np.int64)
+    index = np.asarray(index, dtype=np.int64)[near]
     along = np.abs(np.sum(directions[near] * fused.directions[index], axis=1)) > 0.9
     return near[along].astype(np.int64), index[along]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from canopy_skel.segmenters.labels import LabelledImage
-from mock_hw.orchard.presets import APPLE, OAK, WALNUT
 from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
+from mock_hw.orchard.presets import APPLE, OAK, WALNUT
 from service.training.store import store
 
 TRAIN = Variety(seed=20260101, species=(APPLE, OAK))

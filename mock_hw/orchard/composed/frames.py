@@ -10,13 +10,13 @@ from canopy_skel.frame import Float32Array, UInt8Array
 from canopy_skel.geometry import BoolArray
 from canopy_skel.segmenters.labels import LabelledImage
 from mock_hw.orchard import renderer
+from mock_hw.orchard.composed import clutter, varied
+from mock_hw.orchard.composed.labels import labels_in
 from mock_hw.orchard.light import fair_weather
 from mock_hw.orchard.mesh import Int32Array, Kind
 from mock_hw.orchard.presets import APPLE, OAK
 from mock_hw.orchard.scene import Scene, build_scene
 from mock_hw.orchard.species import Species
-from mock_hw.orchard.composed import clutter, varied
-from mock_hw.orchard.composed.labels import labels_in
 from mock_hw.orchard.tree import grow
 
 FRAMES_PER_SCENE = 4

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from mock_hw.orchard import renderer
-from mock_hw.orchard.mesh import mesh_of_wood
-from mock_hw.orchard.path import camera_path
-from mock_hw.orchard.presets import WALNUT
 from mock_hw.orchard.composed import clutter
 from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
 from mock_hw.orchard.composed.labels import LEAST_PIXELS, labels_in
+from mock_hw.orchard.mesh import mesh_of_wood
+from mock_hw.orchard.path import camera_path
+from mock_hw.orchard.presets import WALNUT
 
 SMALL = Variety(seed=5, width_px=320, height_px=240)
 
