@@ -26,7 +26,7 @@ MOST_MAP_MEMORY = 3 << 30
 def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "canopy",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")] = "recorded",
     weights: Annotated[Path | None, typer.Option(help="Weights of the segmenter (.pt).")] = None,
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,

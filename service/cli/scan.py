@@ -15,7 +15,7 @@ def scan(
     output: Out,
     tree: Annotated[str, typer.Option(help="Which tree this is.")] = "tree",
     path: Annotated[str, typer.Option(help="Named path of waypoints.")] = "orchard-10",
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "canopy",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(SEGMENTERS)}.")] = "recorded",
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
     url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",

@@ -82,7 +82,7 @@ class ScanBody(PlanBody):
     """What to scan and how."""
 
     tree_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-    method: MethodName = "canopy"
+    method: MethodName = "paper"
     voxel_size_m: Annotated[float, Field(ge=0.001, le=0.05, allow_inf_nan=False)] = 0.005
     segmenter: Annotated[
         Literal["recorded", "unet"],

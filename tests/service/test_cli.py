@@ -99,8 +99,8 @@ def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path)
     assert set(summary["seconds"]) >= {"read", "cluster", "spline", "likelihood", "initial", "join"}
 
 
-def test_canopy_is_the_method_unless_another_is_named(canopy, recording, tmp_path):
-    assert canopy("replay", recording, "-o", tmp_path, "--rooted")[0] == 0
+def test_canopy_says_of_every_vertex_how_it_is_known(canopy, recording, tmp_path):
+    assert canopy("replay", recording, "-o", tmp_path, "--method", "canopy", "--rooted")[0] == 0
     document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())
     assert document.method.name == "canopy"
     assert document.components == 1
