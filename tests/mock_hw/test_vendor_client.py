@@ -313,9 +313,9 @@ def test_an_emergency_stop_takes_the_power(client, fake, dashboard):
 
 def test_the_watchdog_ends_the_program_of_a_silent_client(client, fake):
     target = shifted(client, dz=-0.3)
-    assert client.control.setWatchdog(20.0)
+    assert client.control.setWatchdog(4.0)
     assert client.control.moveL(target, 0.01, 0.5, True)
-    for _ in range(10):
+    for _ in range(20):
         client.control.kickWatchdog()
         time.sleep(0.02)
     assert client.control.isProgramRunning()
