@@ -34,6 +34,7 @@ _DAMAGE = (
     CRCValidationError,
     struct.error,
     ValueError,
+    OverflowError,
     MemoryError,
     RuntimeError,
     zstandard.ZstdError,
