@@ -104,7 +104,7 @@ def test_canopy_says_of_every_vertex_how_it_is_known(canopy, recording, tmp_path
     document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())
     assert document.method.name == "canopy"
     assert document.components == 1
-    assert set(document.extra["source"]) == {"observed", "link"}
+    assert {"observed", "link"} <= set(document.extra["source"])
     summary = json.loads((tmp_path / "sticks.summary.json").read_text())
     assert summary["poses"] == []
     assert set(summary["seconds"]) >= {"read", "observe", "evidence", "likelihood", "canopy"}

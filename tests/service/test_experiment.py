@@ -84,7 +84,8 @@ def rows_in(out):
 def test_the_small_experiment_from_recordings_to_page(canopy, grown, tmp_path):
     out = tmp_path / "out"
     segmenters = "recorded,drop50+false20"
-    arguments = ("experiment", "paper-table", "--orchard", grown, "-o", out)
+    methods = ("--methods", "paper,mst,ftsem")
+    arguments = ("experiment", "paper-table", "--orchard", grown, "-o", out, *methods)
     choice = ("--segmenters", segmenters, "--jobs", 2, "--json")
     code, stdout, stderr = canopy(*arguments, *choice)
     summary = json.loads(stdout)

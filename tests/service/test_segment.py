@@ -12,6 +12,7 @@ from scenes.drawn import drawn, straight
 from scenes.wood import view_from
 
 from canopy_skel.recording import RecordingWriter, read_recording
+from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.weights import Model, load, save
@@ -47,7 +48,7 @@ def weights(tmp_path):
         network=network.eval(),
         channels=CHANNELS,
         grouping=Grouping(),
-        calibration=Calibration(weights=(0.0,) * 6, bias=1.0),
+        calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=1.0),
         least_score=0.5,
     )
     save(tmp_path / "small.pt", model, {})

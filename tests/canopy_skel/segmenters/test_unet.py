@@ -1,15 +1,16 @@
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from contracts.segmenter import SegmenterContract
-from scenes.drawn import drawn, straight
 from scenes.views import view_of
 
 from canopy_skel.errors import UsageError, ViewError
+from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.unet import segmenter as module
 from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
@@ -18,6 +19,7 @@ from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.weights import Model, load
 
+DEMO = Path(__file__).parents[3] / "recordings/demo_apple.mcap"
 TORCH_FREE = """
 import sys
 import canopy_skel.pipeline, canopy_skel.recording, canopy_skel.segmenters.recorded
@@ -58,8 +60,7 @@ class TestUNetSegmenter(SegmenterContract):
 
     @pytest.fixture
     def view_with_branches(self):
-        lines = [straight((160, 240), 80, 400, 14), straight((430, 220), 130, 380, 9)]
-        return view_of(drawn(lines, (480, 640)).color_rgb)
+        return next(iter(read_recording(DEMO).views()))
 
     @pytest.fixture
     def empty_view(self):
