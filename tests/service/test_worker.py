@@ -190,6 +190,7 @@ def test_a_stalled_worker_loses_nothing_and_holds_nobody_up(rig, views):
         assert "is silent for" in status.detail
         time.sleep(max(0, stalled_s + 10 - time.monotonic()))
         os.kill(worker.pid, signal.SIGCONT)
+    wait_for(lambda: rig.feeder.worker_status().ready)
     finish(rig)
     assert slowest_s < 0.05
 
