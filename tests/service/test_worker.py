@@ -92,7 +92,7 @@ def test_a_worker_killed_at_view_k_is_caught_up_by_the_next(rig, views, k):
         record(rig, writer, views[:k])
         wait_for(lambda: arrived(rig) >= k)
         first.kill()
-        wait_for(lambda: not rig.feeder.worker_status().ready, 1)
+        wait_for(lambda: not rig.feeder.worker_status().ready, 5)
         record(rig, writer, views[k:])
         rig.start_ready_worker()
         assert rig.feeder.flush(20)  # from the file that is still being written
@@ -105,7 +105,7 @@ def test_a_worker_killed_again_and_again_ends_with_the_same_bytes(rig, views):
             worker = rig.start_ready_worker()
             record(rig, writer, views[k : k + 4])
             worker.kill()
-            wait_for(lambda: not rig.feeder.worker_status().ready, 1)
+            wait_for(lambda: not rig.feeder.worker_status().ready, 5)
     rig.start_ready_worker()
     finish(rig)
 
@@ -295,7 +295,7 @@ def test_a_worker_leaves_at_once_when_it_is_told(rig, views):
         worker.terminate()
         assert worker.wait(5) == 0
         assert time.monotonic() - start_s < 1
-        wait_for(lambda: not rig.feeder.worker_status().ready, 1)
+        wait_for(lambda: not rig.feeder.worker_status().ready, 5)
     assert "Traceback" not in rig.log
 
 
