@@ -37,6 +37,8 @@ from service.server import make_server
 
 ORCHARD = Options(species="apple", leaf_count=200, weather="fair", rows=False)
 TIME_SCALE = 20
+PICTURE_SCALE = 0.2
+CANOPY = Path(sys.executable).with_name("canopy")
 
 
 class Rig:
@@ -177,55 +179,61 @@ def problem(answer, status):
 
 
 @contextmanager
-def served(data, camera=None, version="3.15"):
-    """Serve with a simulated arm and, unless another camera is given, the simulated one."""
-    controllers = []
+def hardware_at(host, camera=None):
+    """An arm at a controller and, unless another camera is given, the simulated one."""
+    # More patient than the rig's: a busy machine is silent for a moment, too.
+    patient = Ur5Config(host=host, watchdog_hz=1.0, stale_after_s=0.8)
+    arm = GuardedArm(Ur5Arm(patient), LIMITS)
+    if camera is not None:
+        yield Hardware(arm, camera, TOOL_FROM_CAMERA, dict)
+        return
+    simulation = prepare(ORCHARD)
+    sim = SimCamera(lambda: arm.state().pose, simulation, scale=PICTURE_SCALE)
+    yield Hardware(
+        arm, sim, simulation.tool_from_camera, lambda: {GROUND_TRUTH: to_json(sim.truth())}
+    )
 
-    @contextmanager
-    def hardware(options):
-        with FakeUr(free_host(), version=version, time_scale=TIME_SCALE) as controller:
-            controllers.append(controller)
-            # More patient than the rig's: a busy machine is silent for a moment, too.
-            patient = Ur5Config(host=controller.host, watchdog_hz=1.0, stale_after_s=0.8)
-            arm = GuardedArm(Ur5Arm(patient), LIMITS)
-            if camera is not None:
-                yield Hardware(arm, camera, TOOL_FROM_CAMERA, dict)
-                return
-            simulation = prepare(ORCHARD)
-            sim = SimCamera(lambda: arm.state().pose, simulation, scale=options.picture_scale)
-            yield Hardware(
-                arm, sim, simulation.tool_from_camera, lambda: {GROUND_TRUTH: to_json(sim.truth())}
-            )
 
-    options = ServeOptions(
+def options_for(data):
+    return ServeOptions(
         data=data,
         robot=None,
         site="test",
         rig="rig-1",
         orchard=ORCHARD,
         time_scale=TIME_SCALE,
-        picture_scale=0.2,
+        picture_scale=PICTURE_SCALE,
     )
-    with composed(options, hardware) as app:
+
+
+@contextmanager
+def served(data, camera=None, version="3.15"):
+    """Serve in this process, before a controller of its own."""
+    with (
+        FakeUr(free_host(), version=version, time_scale=TIME_SCALE) as controller,
+        composed(options_for(data), lambda _: hardware_at(controller.host, camera)) as app,
+    ):
         port = free_port()
         server = make_server(app, port=port, log_level="warning")
         thread = threading.Thread(target=server.run)
         thread.start()
         try:
             with httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as http:
-                yield Rig(http, controllers[0], data)
+                yield Rig(http, controller, data)
         finally:
             server.handle_exit(signal.SIGTERM, None)
             thread.join(10)
 
 
 class Service:
-    """`canopy serve` in a process of its own, with what it started."""
+    """The service in a process of its own, with what it started.
 
-    def __init__(self, data, *options):
-        self._command = [Path(sys.executable).with_name("canopy"), "serve", "--data", data]
-        self._command += options
-        self._data = data
+    command: what to run, without the port. controller: before which it stands, if that is not one
+    of its own; it outlives the service.
+    """
+
+    def __init__(self, data, command, controller=None):
+        self._command, self._data, self._controller = command, data, controller
 
     def launch(self):
         port = free_port()
@@ -233,7 +241,7 @@ class Service:
         self.process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment())
         self.http = httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0)
         wait_until_answering(self.http)
-        return Rig(self.http, None, self._data)
+        return Rig(self.http, self._controller, self._data)
 
     def kill(self):
         """As the kernel does when memory is short: nobody is told."""

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from live_rig import (
+    CANOPY,
     Service,
     problem,
     served,
@@ -158,7 +159,9 @@ def test_a_robot_without_a_camera_starts_nothing_and_says_what_to_do(tmp_path):
     installed = importlib.util.find_spec("depthai") is not None
     mend = "check cable, power and network" if installed else "pip install 'canopy-skel[oak]'"
     with FakeUr(free_host(), time_scale=20) as controller:
-        service = Service(tmp_path, "--robot", controller.host)
+        service = Service(
+            tmp_path, [CANOPY, "serve", "--data", tmp_path, "--robot", controller.host]
+        )
         rig = service.launch()
         try:
             joints = controller.do("state")["joints_rad"]
