@@ -22,3 +22,18 @@ def idle(tmp_path_factory):
 
     with serving(tmp_path_factory.mktemp("idle")) as live:
         yield live
+
+
+@pytest.fixture
+def canopy(monkeypatch, capsys):
+    """Run the command line as a user does; returns exit code, stdout, stderr."""
+    from service.cli import main
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["canopy", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run

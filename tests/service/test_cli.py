@@ -15,23 +15,8 @@ from canopy_skel.confidence import models_from
 from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.recording import RecordingWriter
-from service import cli
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture
-def canopy(monkeypatch, capsys):
-    """Run the command line as a user does; returns exit code, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["canopy", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture

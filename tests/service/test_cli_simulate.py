@@ -9,25 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from service import cli
 from service.skeletons import SOFTWARE
 
 QUICK = ("--species", "walnut", "--topologies", "3-3", "--foliage", "1", "--picture-scale", "0.25")
 CANOPY = (sys.executable, "-c", "from service.cli import main; main()")
-
-
-@pytest.fixture
-def canopy(monkeypatch, capsys):
-    """Run the command line as a user does; returns exit code, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["canopy", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

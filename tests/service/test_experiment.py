@@ -1,7 +1,6 @@
 import csv
 import json
 import shutil
-import sys
 from hashlib import sha256
 
 import numpy as np
@@ -12,7 +11,6 @@ from canopy_skel.frame import Intrinsics
 from canopy_skel.recording import RecordingWriter
 from mock_hw.orchard.camera import Camera
 from mock_hw.orchard.simulate import Options, prepare, truth, views
-from service import cli
 from service.experiment.orchard import Tree
 from service.experiment.published import published
 from service.experiment.rows import Row
@@ -22,20 +20,6 @@ from service.experiment.table import Rows, mean_of
 LENS = Intrinsics(fx_px=330.0, fy_px=330.0, cx_px=240.0, cy_px=150.0, width_px=480, height_px=300)
 TREES = (("apple", 0, 3), ("oak", 0, 3), ("walnut", 1, 4))
 LEAVES = {"apple": 600, "oak": 2500, "walnut": 300}
-
-
-@pytest.fixture
-def canopy(monkeypatch, capsys):
-    """Run the command line as a user does; returns exit code, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["canopy", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

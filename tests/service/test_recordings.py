@@ -1,11 +1,8 @@
 """The figures this project stands for, on recordings that nobody here made."""
 
 import json
-import sys
 
 import pytest
-
-from service import cli
 
 NAMES = ("apple_fd2", "oak_fd3", "apple_dense")
 FLOORS = {  # precision, directional precision
@@ -21,13 +18,11 @@ def out(tmp_path_factory):
 
 
 @pytest.fixture
-def scores_of(out, shared_recording, monkeypatch, capsys):
+def scores_of(out, shared_recording, canopy):
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["canopy", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        assert not stopped.value.code
-        return capsys.readouterr().out
+        code, stdout, _ = canopy(*arguments)
+        assert code == 0
+        return stdout
 
     def scores(name, method):
         path, folder = shared_recording(name), out / method

@@ -1,7 +1,6 @@
 """`canopy segment` and `canopy train` as users call them."""
 
 import json
-import sys
 
 import cv2
 import numpy as np
@@ -16,24 +15,9 @@ from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.weights import Model, load, save
-from service import cli
 
 CHANNELS = (8, 8, 8, 8, 8)
 BARS = [straight((50, 60), 80, 90, 8), straight((115, 60), 15, 70, 7)]
-
-
-@pytest.fixture
-def canopy(monkeypatch, capsys):
-    """Run the command line as a user does; returns exit code, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["canopy", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        captured = capsys.readouterr()
-        return stopped.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture
