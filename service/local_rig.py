@@ -84,7 +84,7 @@ class LocalRig:
         self._arm, self._camera = Opened(parts.arm), Opened(parts.camera)
         self._open = ExitStack()
         self._sessions: dict[str, tuple[ScanSpec, ScanSession]] = {}
-        self._stopped = ""
+        self._stopped, self._stops = "", 0
         self._listeners: list[Callable[[RigEvent], None]] = []
 
     def __enter__(self) -> "LocalRig":
@@ -174,6 +174,7 @@ class LocalRig:
     def stop(self) -> None:
         """Stop the arm now, whatever is under way; an acknowledgement is needed afterwards."""
         self._stopped = "the arm was stopped by the operator"
+        self._stops += 1
         running = [s for _, s in self._sessions.values() if s.status.state is ScanState.RUNNING]
         try:
             if not running:
@@ -186,15 +187,18 @@ class LocalRig:
     def hold(self, reason: str) -> None:
         """Let nothing move until somebody has acknowledged; an earlier reason stays."""
         self._stopped = self._stopped or reason
+        self._stops += 1
 
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again; a scan goes on only by `resume`."""
+        stops = self._stops
         try:
             self._arm.open()
             self._parts.arm.acknowledge(reason)
         except DriverError as error:
             raise _not_ready(error) from error
-        self._stopped = ""
+        if self._stops == stops:  # a stop since then wants an acknowledgement of its own
+            self._stopped = ""
         self._tell("", "acknowledged", {"reason": reason})
 
     def status(self, scan_id: str) -> ScanStatus:

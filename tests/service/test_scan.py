@@ -231,6 +231,25 @@ def test_the_operators_stop_needs_an_acknowledgement(rig, fake):
     assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
 
 
+def test_a_stop_during_an_acknowledgement_wants_one_of_its_own(rig, fake, monkeypatch):
+    rig.stop()
+    arm = rig._parts.arm
+    acknowledge = arm.acknowledge
+
+    def stopped_meanwhile(reason):
+        acknowledge(reason)
+        rig.stop()
+
+    with monkeypatch.context() as patched:
+        patched.setattr(arm, "acknowledge", stopped_meanwhile)
+        rig.acknowledge("looked, nobody near")
+    with pytest.raises(RigNotReadyError, match="stopped by the operator"):
+        rig.start(spec())
+    rig.acknowledge("looked again")
+    rig.start(spec())
+    wait_for(rig, "scan-1", ScanState.DONE)
+
+
 @pytest.mark.parametrize(
     ("fault", "says"),
     [("protective_stop", "ProtectiveStopError"), ("emergency_stop", "EmergencyStopError")],
