@@ -39,10 +39,11 @@ from canopy_skel.exports.overlay import draw_overlay
 from canopy_skel.exports.palette import OBSERVED_RGB, OCCLUDED_RGB
 from canopy_skel.geometry import BoolArray, FloatArray
 from canopy_skel.graph import SkeletonGraph
-from canopy_skel.initial import consolidate, sample_segments, smooth_across
-from canopy_skel.kernels.ellipsoid import voxels_on_segment
+from canopy_skel.initial import consolidate
+from canopy_skel.kernels.ellipsoid import rows_on_segments
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.spline import fit_splines
+from canopy_skel.strands import sample_segments
 
 ROOT = Path(__file__).parents[1]
 MAX_BYTES = 250_000
@@ -194,7 +195,10 @@ def draw_ellipsoid(walk: Walk, ax: plt.Axes, number: int, color: object) -> None
     start, end = walk.segments.starts_in_base[number], walk.segments.ends_in_base[number]
     radius_m, confidence = walk.segments.radius_m[number], walk.segments.confidence[number]
     voxel_m = walk.grid.voxel_size_m
-    for voxel in voxels_on_segment(start / voxel_m, end / voxel_m)[:, walk.shown]:
+    length_vx = float(np.linalg.norm(end - start)) / voxel_m
+    packed = [*start / voxel_m, *(end - start) / voxel_m / length_vx, length_vx]
+    rows = rows_on_segments(np.array([[*packed, radius_m / voxel_m, confidence]]))
+    for voxel in rows[:, 1:4][:, walk.shown]:
         ax.add_patch(Rectangle(voxel * voxel_m, voxel_m, voxel_m, fill=False, ec=color, lw=0.9))
     a, b = walk.flat(np.stack([start, end]))
     length_m = float(np.linalg.norm(b - a))
@@ -223,16 +227,15 @@ def edge_lines(walk: Walk, graph: SkeletonGraph, chosen: BoolArray | None = None
 def draw_initial(walk: Walk) -> plt.Figure:
     """Figure 4: from samples to the initial skeleton."""
     centre, voxel_m = busiest_fork(walk), walk.grid.voxel_size_m
-    samples = sample_segments(walk.segments, 0.5 * voxel_m)
-    smoothed = smooth_across(samples, CONFIG.initial)
-    vertices, _ = consolidate(smoothed, voxel_m)
+    samples, *_ = sample_segments(walk.segments, 0.5 * voxel_m)
+    vertices, _ = consolidate(walk.smoothed, voxel_m)
     figure, axes = plt.subplots(2, 2, figsize=(10, 9), sharex=True, sharey=True)
     for ax, points, title in (
-        (axes[0, 0], samples.points_in_base, "(a) samples of all segments"),
+        (axes[0, 0], samples, "(a) samples of all segments"),
         (
             axes[0, 1],
-            smoothed.points_in_base,
-            f"(b) smoothed, {CONFIG.initial.smoothing_steps} steps",
+            walk.smoothed.points_in_base,
+            f"(b) strands, smoothed in {CONFIG.initial.smoothing.steps} steps",
         ),
         (axes[1, 0], vertices, "(c) one vertex per voxel"),
         (axes[1, 1], walk.initial.vertices_in_base, "(d) G_init: spanning forest, spurs cut"),

@@ -27,7 +27,7 @@ from canopy_skel.recording import read_recording
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.spline import BranchSpline, fit_splines
-from canopy_skel.strands import StrandMap, sample_segments
+from canopy_skel.strands import StrandMap, Strands, sample_segments
 from drivers.stereo import with_depth
 
 CONFIG = MethodConfig()
@@ -52,6 +52,7 @@ class Walk:
     instances: list[Instance]
     segments: Segments
     grid: LikelihoodGrid
+    smoothed: Strands
     initial: SkeletonGraph
     joins: list[Join]
     results: dict[str, SkeletonGraph]
@@ -92,7 +93,8 @@ def walk_through(path: Path) -> Walk:
                 one = Instance(view=view, mask=mask, cluster=clusters[0], spline=fitted[0])
                 instances.append(one)
     segments, grid = segments_of(splines), likelihood.grid()
-    initial = initial_skeleton(strands.smoothed(), likelihood, CONFIG.initial)
+    smoothed = strands.smoothed()
+    initial = initial_skeleton(smoothed, likelihood, CONFIG.initial)
     search = PathSearch(likelihood)
     search.update(initial)
     joins = search.joins()
@@ -109,6 +111,7 @@ def walk_through(path: Path) -> Walk:
         instances=instances,
         segments=segments,
         grid=grid,
+        smoothed=smoothed,
         initial=initial,
         joins=joins,
         results=results,
