@@ -1,7 +1,8 @@
 """Training images for a branch segmenter, as a COCO data set.
 
-Every fragment a network should find is an annotation with polygons and a score; wood too small for
-that is one `iscrowd` region per image, to be ignored. Each image has a label file of its own, so
+The pictures are those the built-in weights are trained on (`composed`), of a seed of your own.
+Every fragment a network should find is an annotation with polygons; wood too small for that is one
+`iscrowd` region per image, to be ignored. Each image has a label file of its own, so
 that the work can be stopped and gone on with; `annotations.json` is put together at the end.
 """
 
@@ -16,11 +17,12 @@ from typing import Any
 import cv2
 
 from canopy_skel.errors import RecordingError, UsageError
+from canopy_skel.segmenters.labels import LabelledImage
 from mock_hw.orchard.camera import Camera, scaled
+from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
 from mock_hw.orchard.files import write_whole
 from mock_hw.orchard.outlines import box, polygons, run_lengths
 from mock_hw.orchard.presets import species_named
-from mock_hw.orchard.training import FRAMES_PER_SCENE, Frame, scene_frames
 from mock_hw.orchard.workers import alone_in, require_jobs, workers
 
 BRANCH = 1
@@ -40,6 +42,20 @@ class TrainingSet:
     def fields(self) -> dict[str, Any]:
         """Return the fields as they come back from JSON."""
         return {**asdict(self), "species": list(self.species)}
+
+    def variety(self) -> Variety:
+        """Return what the pictures are drawn from.
+
+        Raises:
+            UsageError: a species is unknown, or the scale leaves no picture.
+        """
+        lens = scaled(Camera(), self.picture_scale).intrinsics
+        return Variety(
+            seed=self.seed,
+            species=tuple(species_named(name) for name in self.species),
+            width_px=lens.width_px,
+            height_px=lens.height_px,
+        )
 
 
 def export_coco(folder: Path, count: int, images: TrainingSet, *, jobs: int = 1) -> Iterator[int]:
@@ -79,9 +95,7 @@ def _require_possible(count: int, images: TrainingSet) -> None:
         raise UsageError(f"{count} images; give 1 or more")
     if images.seed < 0:
         raise UsageError(f"seed is {images.seed}; give 0 or more")
-    for name in images.species:
-        species_named(name)
-    scaled(Camera(), images.picture_scale)
+    images.variety()
 
 
 def _make_folder(folder: Path) -> None:
@@ -109,9 +123,8 @@ def _missing(folder: Path, count: int, images: TrainingSet) -> list[int]:
 
 def _make_scene(number: int, *, folder: Path, images: TrainingSet, wanted: frozenset[int]) -> int:
     """Write the missing images of a scene and their labels, in a worker; return how many."""
-    camera = scaled(Camera(), images.picture_scale)
-    frames = scene_frames(number, seed=images.seed, species=images.species, camera=camera)
     made = 0
+    frames = scene_frames(images.variety(), number)
     for index, frame in enumerate(frames, start=number * FRAMES_PER_SCENE):
         if index in wanted:
             quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
@@ -123,23 +136,25 @@ def _make_scene(number: int, *, folder: Path, images: TrainingSet, wanted: froze
     return made
 
 
-def label_of(frame: Frame, index: int) -> dict[str, Any]:
-    """Return the COCO entries of an image: `image`, and `annotations` without their own ids."""
+def label_of(frame: LabelledImage, index: int) -> dict[str, Any]:
+    """Return the COCO entries of an image: `image`, and `annotations` without their own ids.
+
+    Pictures of one tree have the same `scan_id`, by which data sets are split.
+    """
     height, width = frame.color_rgb.shape[:2]
     image = {
         "id": index,
         "file_name": f"images/{_name(index)}.jpg",
         "width": width,
         "height": height,
-        "species": frame.species,
-        "topology": frame.topology,
-        "leaf_count": frame.leaf_count,
+        "scan_id": index // FRAMES_PER_SCENE,
     }
     return {"image": image, "annotations": list(_annotations(frame, index))}
 
 
-def _annotations(frame: Frame, index: int) -> Iterator[dict[str, Any]]:
-    for mask, score in zip(frame.masks, frame.scores, strict=True):
+def _annotations(frame: LabelledImage, index: int) -> Iterator[dict[str, Any]]:
+    for number in range(1, len(frame.lines) + 1):
+        mask = frame.instances == number
         yield {
             "image_id": index,
             "category_id": BRANCH,
@@ -147,7 +162,6 @@ def _annotations(frame: Frame, index: int) -> Iterator[dict[str, Any]]:
             "area": int(mask.sum()),
             "bbox": box(mask),
             "iscrowd": 0,
-            "score": score,
         }
     if frame.ignore.any():
         counts = {"size": list(frame.ignore.shape), "counts": run_lengths(frame.ignore)}

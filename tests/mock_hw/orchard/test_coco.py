@@ -9,20 +9,18 @@ import pytest
 from pycocotools.coco import COCO
 
 from canopy_skel.errors import RecordingError, UsageError
-from mock_hw.orchard.camera import Camera, scaled
 from mock_hw.orchard.coco import TrainingSet, export_coco
-from mock_hw.orchard.training import FIRST_FITTING_TOPOLOGY, FRAMES_PER_SCENE, scene_frames
+from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, scene_frames
 
 # pycocotools 2.0 is older than numpy 2.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 COUNT = FRAMES_PER_SCENE + 1
-IMAGES = TrainingSet(seed=3, picture_scale=0.25, software="test")
+IMAGES = TrainingSet(seed=3, picture_scale=0.4, software="test")
 
 
 @pytest.fixture(scope="module")
 def frames():
-    camera = scaled(Camera(), IMAGES.picture_scale)
-    both = (scene_frames(number, seed=IMAGES.seed, camera=camera) for number in (0, 1))
+    both = (scene_frames(IMAGES.variety(), number) for number in (0, 1))
     return [frame for scene in both for frame in scene][:COUNT]
 
 
@@ -50,11 +48,12 @@ def contents(folder):
 def test_a_coco_reader_finds_every_instance_to_the_pixel(coco, frames):
     assert coco.getCatIds(catNms=["branch"]) == [1]
     assert sorted(coco.getImgIds()) == list(range(COUNT))
-    assert sum(len(frame.masks) for frame in frames) > 20
+    assert sum(len(frame.lines) for frame in frames) > 20
     for index, frame in enumerate(frames):
         pieces = coco.loadAnns(coco.getAnnIds(index, iscrowd=False))
-        assert [piece["score"] for piece in pieces] == list(frame.scores)
-        for piece, mask in zip(pieces, frame.masks, strict=True):
+        assert len(pieces) == len(frame.lines)
+        for number, piece in enumerate(pieces, start=1):
+            mask = frame.instances == number
             found = coco.annToMask(piece).astype(bool)
             assert np.array_equal(found, mask)
             assert piece["area"] == mask.sum()
@@ -74,16 +73,14 @@ def test_what_is_too_small_to_be_found_is_to_be_ignored(coco, frames):
             assert crowd["area"] == frame.ignore.sum()
 
 
-def test_images_are_the_pictures_and_say_what_is_in_them(folder, coco, frames):
-    for image, frame in zip(coco.loadImgs(range(COUNT)), frames, strict=True):
+def test_images_are_the_pictures_and_say_which_tree_they_show(folder, coco, frames):
+    images = coco.loadImgs(range(COUNT))
+    for image, frame in zip(images, frames, strict=True):
         picture = cv2.imread(str(folder / image["file_name"]))
         assert picture.shape == (image["height"], image["width"], 3)
         assert np.abs(picture[..., ::-1].astype(int) - frame.color_rgb).mean() < 6
-        assert (image["species"], image["topology"]) == (frame.species, frame.topology)
-        assert image["leaf_count"] == frame.leaf_count
-        assert frame.topology >= FIRST_FITTING_TOPOLOGY
+    assert [image["scan_id"] for image in images] == [0] * FRAMES_PER_SCENE + [1]
     assert frames[0].color_rgb.tobytes() != frames[1].color_rgb.tobytes()
-    assert frames[0].topology != frames[FRAMES_PER_SCENE].topology
 
 
 def test_a_data_set_is_finished_and_made_larger_with_the_same_bytes(folder, tmp_path):

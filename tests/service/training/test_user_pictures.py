@@ -233,16 +233,16 @@ def test_missing_and_other_pictures_are_refused(folder, tmp_path):
 
 
 def test_the_synthetic_orchards_own_coco_files_are_read_to_the_pixel(tmp_path):
-    from mock_hw.orchard.camera import Camera, scaled
     from mock_hw.orchard.coco import TrainingSet, export_coco
-    from mock_hw.orchard.training import scene_frames
+    from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, scene_frames
 
-    list(export_coco(tmp_path, 2, TrainingSet(seed=3, picture_scale=0.2, software="test")))
+    data = TrainingSet(seed=3, picture_scale=0.3, software="test")
+    list(export_coco(tmp_path, FRAMES_PER_SCENE + 1, data))
     pictures, _ = read_coco(tmp_path / "annotations.json", tmp_path)
-    frames = scene_frames(0, seed=3, camera=scaled(Camera(), 0.2))
-    for picture, frame in zip(pictures, frames, strict=False):
+    assert [picture.scan for picture in pictures] == ["0"] * FRAMES_PER_SCENE + ["1"]
+    for picture, frame in zip(pictures, scene_frames(data.variety(), 0), strict=False):
         image = labelled(picture).image
-        wood = np.any(frame.masks, axis=0)
+        wood = frame.instances > 0
         found = image.instances > 0
         assert not (found & ~wood).any()
         assert (found | image.ignore)[wood].all()
