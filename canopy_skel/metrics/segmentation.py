@@ -76,14 +76,16 @@ class SegmentationScores:
 class Judgement:
     """What one picture adds to the scores.
 
-    confidence, at30, at50, at_line, on_wood: (N,) of the instances that count: how sure, whether
-    matched by IoU 0.3, 0.5 and by middle line, whether most pixels are wood. true_count: instances
+    place, confidence, at30, at50, at_line, on_wood: (N,) of the instances that count: where among
+    those found, how sure, whether matched by IoU 0.3, 0.5 and by middle line, whether most pixels
+    are wood. true_count: instances
     to be found. pixels: wood in both, found, true. line_px: lengths of found lines, of these
     inside true wood, of these near true lines; of true lines, of these inside found wood, of these
     near found lines.
     """
 
     threshold: float
+    place: IntArray
     confidence: FloatArray
     at30: BoolArray
     at50: BoolArray
@@ -115,6 +117,7 @@ def judge(
     chosen = [place for place in range(len(masks)) if sure[place]]
     return Judgement(
         threshold=threshold,
+        place=order[counts],
         confidence=confidence[counts],
         at30=at30[counts],
         at50=at50[counts],

@@ -81,7 +81,7 @@ def train(
     typer.echo(f"{weights}: trained for {facts['training']['steps']} steps")
     typer.echo(f"  judged on: {facts['validation']['kind']}")
     for name, value in facts["validation"]["reported"].items():
-        typer.echo(f"  {name:24} {value:g}")
+        typer.echo(f"  {name:24} {'none' if value is None else f'{value:g}'}")
 
 
 def _by_recipe(

@@ -18,7 +18,7 @@ from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.weights import Model, save
 from service.training import builtin
-from service.training.judging import Sighting, calibrated, figures, sight, threshold
+from service.training.judging import Sighting, calibrated, figures, rescored, sight, threshold
 from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
 from service.training.store import StoredImages
@@ -90,13 +90,13 @@ def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any
     candidates = [(path, *_candidate(path, run.plan.channels, halves.choose)) for path in paths]
     chosen_path, model, chosen = max(candidates, key=lambda c: _line_ap(c[2]))
     calibration = calibrated(chosen)
-    least = threshold([s.judged for s in _scored(chosen, calibration)], WANTED_PRECISION)
+    least = threshold(rescored(chosen, calibration), WANTED_PRECISION)
     model = replace(model, calibration=calibration, least_score=least)
     facts = {
         "validation": {
             "kind": "synthetic, of a species, bark and backgrounds no training picture has",
-            "chosen_on": _rounded(figures(_again(model, halves.choose), least)),
-            "reported": _rounded(figures(_again(model, halves.report), least)),
+            "chosen_on": _figures(_again(model, halves.choose)),
+            "reported": _figures(_again(model, halves.report)),
         },
         "training": {
             "plan": asdict(run.plan),
@@ -149,19 +149,13 @@ def _again(model: Model, images: Sequence[LabelledImage]) -> list[Sighting]:
     ]
 
 
-def _scored(sightings: Sequence[Sighting], calibration: Calibration) -> list[Sighting]:
-    return [
-        replace(s, judged=replace(s.judged, scores=calibration.scores(s.features)))
-        for s in sightings
-    ]
-
-
 def _line_ap(sightings: Sequence[Sighting]) -> float:
-    return figures(_scored(sightings, calibrated(sightings)), 0.0)["line_ap"]
+    return figures(rescored(sightings, calibrated(sightings))).line_ap or 0.0
 
 
-def _rounded(values: dict[str, float]) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in values.items()}
+def _figures(sightings: Sequence[Sighting]) -> dict[str, float | int | None]:
+    values = figures(sightings).to_dict()
+    return {name: None if value is None else round(value, 4) for name, value in values.items()}
 
 
 def digest(images: StoredImages) -> str:

@@ -109,6 +109,18 @@ def test_a_branch_found_in_pieces_is_wood_but_counts_once():
     assert (result.ece, result.ece_wood) == (pytest.approx(0.4), pytest.approx(0.1))
 
 
+def test_two_branches_in_a_row_taken_for_one_are_wood_but_neither_is_found():
+    halves = [bar((50, 20), (90, 33), 5), bar((100, 37), (140, 50), 5)]
+    result = scores([instance(BRANCH)], picture(*halves))
+    assert (result.recall, result.precision, result.precision_wood) == (0, 0, 1.0)
+
+
+def test_a_branch_found_twice_counts_once_by_the_surer_one():
+    once = scores([instance(BRANCH, 0.9)], picture(BRANCH))
+    twice = scores([instance(BRANCH, 0.7), instance(BRANCH, 0.9)], picture(BRANCH))
+    assert (once.line_ap, twice.line_ap, twice.precision) == (1, 1, 0.5)
+
+
 def test_a_stout_trunk_is_found_though_its_middle_is_off_by_more_than_a_twigs_width():
     trunk = bar((60, 0), (60, 119), 51)
     shifted = bar((68, 0), (68, 119), 51)

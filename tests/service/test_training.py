@@ -7,12 +7,12 @@ import torch
 from scenes.drawn import drawn, straight
 
 from canopy_skel.errors import UsageError
-from canopy_skel.metrics.instances import Judged, calibration_error
+from canopy_skel.metrics.segmentation import Judgement
 from canopy_skel.segmenters.unet.weights import load
 from service.training import builtin, loop
 from service.training.builtin import Amounts
 from service.training.crops import draw_batch
-from service.training.judging import Sighting, calibrated
+from service.training.judging import Sighting, calibrated, figures, rescored, threshold
 from service.training.loop import Plan, resume, start, train
 from service.training.recipe import builtin_weights
 from service.training.store import StoredImages, store
@@ -146,16 +146,39 @@ def test_the_recipe_goes_from_nothing_to_weights_and_on_where_it_was(tmp_path, m
     assert (tmp_path / "run" / "log.jsonl").read_text().splitlines()[: len(log)] == log
 
 
-def test_calibrated_scores_are_the_share_that_is_real():
+def test_calibrated_scores_are_the_share_that_is_wood():
     rng = np.random.default_rng(0)
     features = rng.normal(size=(4000, 3)) * [1, 10, 0.1] + [5, 0, 0]
     real = rng.random(4000) < 1 / (1 + np.exp(-(2 * (features[:, 0] - 5) + 0.1 * features[:, 1])))
-    scores = np.zeros(4000)
-    judged = Judged(
-        scores=scores, found=real, real=real, number=np.arange(4000), matched=np.zeros(0, bool)
-    )
-    nothing = np.zeros(2, np.int64)
-    sighting = Sighting(judged=judged, features=features, common=nothing, either=nothing)
+    sighting = Sighting(judgement=judgement(real), features=features)
     calibration = calibrated([sighting])
-    assert calibration_error(calibration.scores(features), real) < 0.03
+    assert figures(rescored([sighting], calibration)).ece_wood < 0.03
     assert calibration.weights[:2] == pytest.approx((2, 0.1), rel=0.15)
+
+
+def judgement(real):
+    none = np.zeros(len(real), dtype=bool)
+    return Judgement(
+        threshold=0.5,
+        place=np.arange(len(real)),
+        confidence=np.zeros(len(real)),
+        at30=none,
+        at50=none,
+        at_line=none,
+        on_wood=real,
+        true_count=1,
+        pixels=np.zeros(3, np.int64),
+        line_px=np.zeros(6),
+    )
+
+
+def test_the_threshold_is_the_lowest_that_is_precise_enough():
+    scores = np.linspace(0, 1, 101) + 0.005
+    sighting = Sighting(
+        judgement=replace(judgement(scores > 0.6), confidence=scores), features=scores[:, None]
+    )
+    # Of the 51 from 0.5 on, 41 are wood.
+    assert threshold([sighting], 41 / 51) == 0.5
+    assert threshold([sighting], 1.0) == 0.6
+    hopeless = replace(sighting, judgement=replace(judgement(scores > 2), confidence=scores))
+    assert threshold([hopeless], 0.5) == 0.95

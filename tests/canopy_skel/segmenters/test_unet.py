@@ -24,7 +24,7 @@ TORCH_FREE = """
 import sys
 import canopy_skel.pipeline, canopy_skel.recording, canopy_skel.segmenters.recorded
 import canopy_skel.segmenters.labels, canopy_skel.segmenters.unet.grouping
-import canopy_skel.segmenters.unet.targets, canopy_skel.metrics.instances
+import canopy_skel.segmenters.unet.targets, canopy_skel.metrics.segmentation
 import service.cli, service.replay, service.worker, service.compose, service.skeletons
 service.skeletons.SEGMENTERS["recorded"]()
 print("torch" in sys.modules)
