@@ -9,7 +9,7 @@ from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_fra
 from mock_hw.orchard.presets import APPLE, OAK, WALNUT
 from service.training.store import store
 
-TRAIN = Variety(seed=20260101, species=(APPLE, OAK))
+TRAIN = Variety(seed=20260101, species=(APPLE, OAK), clutter=1.6)
 VALIDATE = Variety(seed=20260102, species=(WALNUT,), strange=True)
 
 
@@ -17,7 +17,7 @@ VALIDATE = Variety(seed=20260102, species=(WALNUT,), strange=True)
 class Amounts:
     """How many scenes (of four pictures each) are drawn."""
 
-    train_scenes: int = 140
+    train_scenes: int = 220
     validate_scenes: int = 30
 
 

@@ -92,7 +92,7 @@ def _recoloured(color: UInt8Array, rng: np.random.Generator) -> UInt8Array:
     """Change brightness, gamma, saturation and white balance by one table per channel."""
     if rng.random() < 0.3:
         return color
-    gamma, gain = np.exp(rng.normal(0, 0.2)), np.exp(rng.normal(0, 0.15))
+    gamma, gain = np.exp(rng.normal(0, 0.3)), np.exp(rng.normal(0, 0.2))
     ramp = np.linspace(0, 1, 256) ** gamma
     tint = np.exp(rng.normal(0, 0.06, 3)) * gain
     table = np.clip(255 * ramp[:, None] * tint, 0, 255).astype(np.uint8)

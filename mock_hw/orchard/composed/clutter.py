@@ -210,12 +210,15 @@ def ties(rng: np.random.Generator, wood: BoolArray, count: int) -> Layer:
     return Layer(rgb=rgb, alpha=alpha)
 
 
-def foreground(rng: np.random.Generator, wood: BoolArray) -> list[Layer]:
-    """Draw what stands between camera and tree: (H, W) wood tells where ties may be."""
+def foreground(rng: np.random.Generator, wood: BoolArray, often: float = 1.0) -> list[Layer]:
+    """Draw what stands between camera and tree.
+
+    wood: (H, W), where ties may be. often: how many times as often as usual there is hardware.
+    """
     layers = []
     size = wood.shape[0], wood.shape[1]
     for kind, chance in (("wire", 0.25), ("drip", 0.15), ("stake", 0.12), ("post", 0.07)):
-        while rng.random() < chance:
+        while rng.random() < chance * often:
             layers.append(_softened(hardware(rng, size, kind), float(rng.uniform(0, 0.8))))
     if rng.random() < 0.15:
         layers.append(ties(rng, wood, int(rng.integers(1, 6))))

@@ -31,11 +31,14 @@ class Variety:
 
     species: parents of all trees. strange: keep the parents' growth and leaves as they are, with
     bark and backgrounds no other set has (to validate on another kind, not only another seed).
+    clutter: how many times as often as usual rows, trellis, posts and wires stand about; what is no
+    branch is learnt from few pictures otherwise.
     """
 
     seed: int
     species: tuple[Species, ...] = (APPLE, OAK)
     strange: bool = False
+    clutter: float = 1.0
     width_px: int = 960
     height_px: int = 720
 
@@ -67,8 +70,8 @@ def _any_scene(rng: np.random.Generator, variety: Variety) -> Scene:
         varied.any_leaf_count(rng, species),
         fair_weather() if plain else varied.any_light(rng),
         seed=int(rng.integers(1 << 31)),
-        rows=bool(not plain and rng.random() < 0.45),
-        trellis=bool(not plain and rng.random() < 0.5),
+        rows=bool(not plain and rng.random() < 0.45 * variety.clutter),
+        trellis=bool(not plain and rng.random() < 0.5 * variety.clutter),
     )
 
 
@@ -106,7 +109,7 @@ def _composed(
         pattern = clutter.banded(rng, size) if variety.strange else clutter.dapple(rng, size)
         shade = np.where(wood, pattern, np.float32(1))
         linear = linear * shade[..., None]
-    if rng.random() < 0.65:
+    if rng.random() < 0.65 / variety.clutter:
         behind = np.isin(kind, _BEHIND)
         level = float(np.clip(np.median(linear), 0.05, 1.0)) * float(np.exp(rng.normal(0.3, 0.5)))
         if variety.strange:
@@ -117,7 +120,7 @@ def _composed(
         edge = cv2.GaussianBlur(behind.astype(np.float32), (0, 0), 0.6)[..., None]
         share = np.where(behind[..., None], np.maximum(edge, 0.75), 0.0).astype(np.float32)
         linear = linear + share * (back - linear)
-    for layer in clutter.foreground(rng, wood):
+    for layer in clutter.foreground(rng, wood, variety.clutter):
         linear = layer.over(linear)
         vertex = np.where(layer.alpha > _HIDES, np.int32(-1), vertex)
     return np.asarray(linear, dtype=np.float32), vertex
