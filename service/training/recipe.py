@@ -26,7 +26,7 @@ from service.training.store import StoredImages
 WANTED_PRECISION = 0.92
 _CANDIDATES = 3
 UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
-BUILTIN_PLAN = Plan(steps=9300, look_every=300)
+BUILTIN_PLAN = Plan(steps=8400, look_every=300)
 
 Progress = Callable[[str, int, int], None]
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray, IntArray
@@ -71,20 +72,26 @@ def _ends_of(paths: list[I32], log_radius: Float32Array) -> _Ends:
 
 def _candidates(ends: _Ends) -> IntArray:
     """Return (M, 2) pairs of ends that may go on in each other, the best first."""
-    gap = ends.place[None] - ends.place[:, None]
-    distance = np.linalg.norm(gap, axis=2)
-    radius = np.exp(np.minimum(ends.log_radius[:, None], ends.log_radius[None]))
-    along = np.einsum("abk,ak->ab", gap, ends.tangent)
-    aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
-    cosine = -ends.tangent @ ends.tangent.T
-    fits = distance <= np.maximum(_GAP_CELLS, _GAP_RADII * radius)
-    fits &= (aside <= np.maximum(_ASIDE_CELLS, _ASIDE_RADII * radius)) & (along > -radius)
+    radius = np.exp(ends.log_radius)
+    near = max(_GAP_CELLS, _GAP_RADII * float(radius.max()))
+    # A tree, not all pairs: a large picture has tens of thousands of ends.
+    pairs = cKDTree(ends.place).query_pairs(near, output_type="ndarray")
+    pairs = pairs[pairs[:, 0] // 2 < pairs[:, 1] // 2]
+    pairs = pairs[np.lexsort(pairs.T[::-1])].astype(np.int64)
+    a, b = pairs.T
+    gap = ends.place[b] - ends.place[a]
+    distance = np.linalg.norm(gap, axis=1)
+    thin = np.minimum(radius[a], radius[b])
+    cosine = -np.sum(ends.tangent[a] * ends.tangent[b], axis=1)
+    fits = distance <= np.maximum(_GAP_CELLS, _GAP_RADII * thin)
+    for tangent, way in ((ends.tangent[a], gap), (ends.tangent[b], -gap)):
+        along = np.sum(way * tangent, axis=1)
+        aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
+        fits &= (aside <= np.maximum(_ASIDE_CELLS, _ASIDE_RADII * thin)) & (along > -thin)
     fits &= cosine >= np.cos(np.radians(_TURN_DEG))
-    fits &= np.abs(ends.log_radius[:, None] - ends.log_radius[None]) <= _RATIO
-    a, b = np.nonzero(fits & fits.T)
-    a, b = a[a // 2 < b // 2], b[a // 2 < b // 2]
-    cost = distance[a, b] + 30.0 * (1.0 - cosine[a, b])
-    return np.stack([a, b], axis=1)[np.argsort(cost, kind="stable")]
+    fits &= np.abs(ends.log_radius[a] - ends.log_radius[b]) <= _RATIO
+    cost = distance[fits] + 30.0 * (1.0 - cosine[fits])
+    return np.asarray(pairs[fits][np.argsort(cost, kind="stable")])
 
 
 def _concatenated(one: I32, other: I32, from_place: FloatArray, to_place: FloatArray) -> I32:

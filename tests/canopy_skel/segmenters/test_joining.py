@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -60,3 +62,16 @@ def test_many_in_a_row_become_one_and_none_is_lost():
     (one,) = joined(pieces, LOG_RADIUS, RULE)
     assert sorted(one[:, 1]) == sorted(np.concatenate(pieces)[:, 1])
     assert joined([], LOG_RADIUS, RULE) == []
+
+
+def test_the_thousands_of_pieces_of_a_large_picture_do_not_take_its_memory():
+    log_radius = np.full((4000, 40), np.log(1.5), dtype=np.float32)
+    column = np.arange(5, 35, dtype=np.int32)
+    rows = np.arange(5, 3995, dtype=np.int32)[::3]
+    paths = [np.stack([np.full_like(column, row), column], axis=1) for row in rows]
+    tracemalloc.start()
+    result = joined(paths, log_radius, RULE)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(result) == len(paths) > 1300
+    assert peak_bytes < 8e6  # one number for each pair of ends would be 57 MB
