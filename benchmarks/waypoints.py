@@ -1,11 +1,13 @@
 """What a scan costs per waypoint beyond motion, settling, exposure and rendering.
 
 python benchmarks/waypoints.py [--views 10|70] [--time-scale 3] [--picture-scale 0.5]
+                               [--segmenter recorded|unet]
 
 A whole simulated scan over HTTP: the real arm client against the fake controller, bus, worker. The
 controller says how long the arm was in motion; five packages at rest are settling; until the
 picture's own stamp it is exposed, from there on drawn. The rest of the time from one recorded view
-to the next is overhead, and split by what the scan was doing.
+to the next is overhead, and split by what the scan was doing. How far the skeleton is behind is the
+time from a view's record to the first skeleton that it is in.
 """
 
 import argparse
@@ -52,6 +54,7 @@ class Watched:
     def __init__(self, controller):
         self.controller = controller
         self.rows = []
+        self.recorded_s = []
         self._row = {}
         self._began_s = 0.0
         self._moved_s = 0.0
@@ -80,6 +83,7 @@ class Watched:
             total_s = time.perf_counter() - self._began_s
             row["other"] = total_s - sum(row.values())
             self.rows.append(row)
+            self.recorded_s.append(time.perf_counter())
 
     def grabbed(self, asked_ns, stamp_ns, done_ns):
         self._row["exposure"] += (stamp_ns - asked_ns) / 1e9
@@ -112,13 +116,14 @@ def options_of(argv):
     parser.add_argument("--views", type=int, choices=(10, 70), default=10)
     parser.add_argument("--time-scale", type=float, default=3.0)
     parser.add_argument("--picture-scale", type=float, default=0.5)
+    parser.add_argument("--segmenter", choices=("recorded", "unet"), default="recorded")
     return parser.parse_args(argv)
 
 
 def main(argv):
     options = options_of(argv)
     with tempfile.TemporaryDirectory() as data, serving(Path(data), options) as (http, watched):
-        scan(http, f"orchard-{options.views}")
+        known_s = scan(http, f"orchard-{options.views}", options.segmenter)
         rows = watched.rows
     print(
         f"{len(rows)} waypoints, arm {options.time_scale:g} times real speed, pictures"
@@ -126,6 +131,10 @@ def main(argv):
     )
     print_rows(rows)
     print_summary(rows)
+    behind = [known_s[k] - recorded_s for k, recorded_s in enumerate(watched.recorded_s, start=1)]
+    print_line(
+        "behind", behind, f"from a view's record to a skeleton with it ({options.segmenter})"
+    )
 
 
 @contextmanager
@@ -175,15 +184,38 @@ def wait_until_ready(http):
         time.sleep(0.2)
 
 
-def scan(http, path):
-    body = {"tree_id": "bench", "path": path}
+def scan(http, path, segmenter):
+    """Return when the skeleton first had 1, 2, … views in it."""
+    body = {"tree_id": "bench", "path": path, "segmenter": segmenter}
     answer = http.post("/v1/scans", json=body, headers={"Idempotency-Key": "1"})
     answer.raise_for_status()
     where = answer.headers["Location"]
+    known_s = {}
+    following = threading.Thread(target=follow, args=(http, where, known_s))
+    following.start()
     while (status := http.get(where).json())["state"] == "running":
         time.sleep(0.5)
     if status["state"] != "done":
         sys.exit(f"the scan is {status['state']}: {status['detail']}")
+    following.join()
+    return known_s
+
+
+def follow(http, where, known_s):
+    """Note each skeleton as it comes, until the scan is over and no newer one does."""
+    etag, over = "", False
+    while True:
+        headers = {"Prefer": "wait=2", "If-None-Match": etag, "Accept": "application/json"}
+        answer = http.get(f"{where}/skeleton", headers=headers)
+        if answer.status_code == 200:
+            etag, now_s = answer.headers["ETag"], time.perf_counter()
+            for k in range(len(known_s) + 1, answer.json()["views"]["used"] + 1):
+                known_s[k] = now_s
+        elif over:
+            return
+        else:
+            time.sleep(0.02)
+        over = http.get(where).json()["state"] != "running"
 
 
 def overhead_s(row):

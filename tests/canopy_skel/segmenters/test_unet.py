@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -28,6 +29,24 @@ import canopy_skel.segmenters.unet.targets, canopy_skel.metrics.segmentation
 import service.cli, service.replay, service.worker, service.compose, service.skeletons
 service.skeletons.SEGMENTERS["recorded"]()
 print("torch" in sys.modules)
+"""
+
+
+ONE_CORE = """
+import os, sys, time
+from pathlib import Path
+from canopy_skel.recording import read_recording
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+from canopy_skel.segmenters.unet.weights import load
+import torch
+view = next(iter(read_recording(Path(sys.argv[1])).views()))
+segmenter = UNetSegmenter(load())
+segmenter.segment(view)
+wall_s, cpu_s = time.perf_counter(), time.process_time()
+for _ in range(3):
+    segmenter.segment(view)
+wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+print(torch.get_num_threads(), os.environ["OMP_WAIT_POLICY"], cpu_s <= 1.2 * wall_s)
 """
 
 
@@ -72,6 +91,18 @@ def test_only_the_learned_segmenter_loads_torch():
         [sys.executable, "-c", TORCH_FREE], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "False"
+
+
+def test_segmenting_keeps_to_one_core_however_many_there_are():
+    free = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_CORE, str(DEMO)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=free,
+    )
+    assert done.stdout.split() == ["1", "PASSIVE", "True"]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 500), (97, 131), (64, 64)])
