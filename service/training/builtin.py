@@ -18,7 +18,7 @@ class Amounts:
     """How many scenes (of four pictures each) are drawn."""
 
     train_scenes: int = 220
-    validate_scenes: int = 30
+    validate_scenes: int = 60
 
 
 def draw(folder: Path, amounts: Amounts, progress: Callable[[str, int, int], None]) -> None:

@@ -67,7 +67,7 @@ def builtin_weights(
     run = resume(plan, folder / "run") or start(plan)
     validate = StoredImages(folder / "data" / "validate")
     pictures = StoredImages(folder / "data" / "train")
-    look = Look(validate, choosing(validate)[::2])
+    look = Look(validate, choosing(validate)[::4])
 
     def looked(network: UNet) -> dict[str, float]:
         progress("steps", run.step, plan.steps)
