@@ -16,6 +16,10 @@ _GAP_RADII = 1.5
 _ASIDE_RADII = 0.5
 _ASIDE_CELLS = 1.5
 _RATIO = 0.6
+_BACK_CELLS = 12.0
+_BESIDE_CELLS = 3.0
+_BESIDE_TURN_DEG = 25.0
+_BESIDE_RATIO = 0.4
 _TANGENT_CELLS = 12
 
 
@@ -70,32 +74,71 @@ def _ends_of(paths: list[I32], log_radius: Float32Array) -> _Ends:
     )
 
 
-def _candidates(ends: _Ends) -> IntArray:
-    """Return (M, 2) pairs of ends that may go on in each other, the best first."""
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Pairs:
+    """How M pairs of ends (M, 2) lie to each other; lengths in cells, (M,) each.
+
+    along, aside: from either end to the other, the worse of the two. radius: the smaller one.
+    ratio: of the radii, logarithmic.
+    """
+
+    ends: IntArray
+    distance: FloatArray
+    along: FloatArray
+    aside: FloatArray
+    turn_deg: FloatArray
+    radius: FloatArray
+    ratio: FloatArray
+
+
+def _pairs_of(ends: _Ends) -> _Pairs:
+    """Compare ends that are near each other; all pairs of a large picture would fill the memory."""
     radius = np.exp(ends.log_radius)
-    near = max(_GAP_CELLS, _GAP_RADII * float(radius.max()))
-    # A tree, not all pairs: a large picture has tens of thousands of ends.
+    near = max(_GAP_CELLS, _BACK_CELLS + _BESIDE_CELLS, _GAP_RADII * float(radius.max()))
     pairs = cKDTree(ends.place).query_pairs(near, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 < pairs[:, 1] // 2]
     pairs = pairs[np.lexsort(pairs.T[::-1])].astype(np.int64)
     a, b = pairs.T
     gap = ends.place[b] - ends.place[a]
     distance = np.linalg.norm(gap, axis=1)
-    thin = np.minimum(radius[a], radius[b])
+    along = np.stack([(gap * ends.tangent[a]).sum(axis=1), (-gap * ends.tangent[b]).sum(axis=1)])
+    aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
     cosine = -np.sum(ends.tangent[a] * ends.tangent[b], axis=1)
-    fits = distance <= np.maximum(_GAP_CELLS, _GAP_RADII * thin)
-    for tangent, way in ((ends.tangent[a], gap), (ends.tangent[b], -gap)):
-        along = np.sum(way * tangent, axis=1)
-        aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
-        fits &= (aside <= np.maximum(_ASIDE_CELLS, _ASIDE_RADII * thin)) & (along > -thin)
-    fits &= cosine >= np.cos(np.radians(_TURN_DEG))
-    fits &= np.abs(ends.log_radius[a] - ends.log_radius[b]) <= _RATIO
-    cost = distance[fits] + 30.0 * (1.0 - cosine[fits])
-    return np.asarray(pairs[fits][np.argsort(cost, kind="stable")])
+    return _Pairs(
+        ends=pairs,
+        distance=distance,
+        along=along.min(axis=0),
+        aside=aside.max(axis=0),
+        turn_deg=np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))),
+        radius=np.minimum(radius[a], radius[b]),
+        ratio=np.abs(ends.log_radius[a] - ends.log_radius[b]),
+    )
+
+
+def _candidates(ends: _Ends) -> IntArray:
+    """Return (M, 2) pairs of ends that may go on in each other, the best first.
+
+    Either one follows on the other, or they run side by side for a bit, as thinned lines do where a
+    branch is wide or touches another.
+    """
+    pairs = _pairs_of(ends)
+    wide = np.maximum(_ASIDE_CELLS, _ASIDE_RADII * pairs.radius)
+    follows = pairs.distance <= np.maximum(_GAP_CELLS, _GAP_RADII * pairs.radius)
+    follows &= (pairs.aside <= wide) & (pairs.along > -pairs.radius)
+    follows &= (pairs.turn_deg <= _TURN_DEG) & (pairs.ratio <= _RATIO)
+    beside = (pairs.along <= 0) & (pairs.along >= -_BACK_CELLS)
+    beside &= pairs.aside <= np.maximum(_BESIDE_CELLS, wide)
+    beside &= (pairs.turn_deg <= _BESIDE_TURN_DEG) & (pairs.ratio <= _BESIDE_RATIO)
+    fits = follows | beside
+    cost = pairs.distance[fits] + 30.0 * (1.0 - np.cos(np.radians(pairs.turn_deg[fits])))
+    return np.asarray(pairs.ends[fits][np.argsort(cost, kind="stable")])
 
 
 def _concatenated(one: I32, other: I32, from_place: FloatArray, to_place: FloatArray) -> I32:
     """Put two paths into one, so that the given ends meet."""
     first = one if np.array_equal(one[-1], from_place) else one[::-1]
     second = other if np.array_equal(other[0], to_place) else other[::-1]
+    way = first[-1] - first[-min(_TANGENT_CELLS, len(first))]
+    if way.any():  # what of the second runs beside the first is left out
+        second = second[np.logical_or.accumulate((second - first[-1]) @ way > 0)]
     return np.ascontiguousarray(np.concatenate([first, second]))

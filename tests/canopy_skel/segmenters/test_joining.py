@@ -42,6 +42,15 @@ def test_what_does_not_stays_two(second):
     assert cells_of(joined([first, second], LOG_RADIUS, RULE)) == cells_of([first, second])
 
 
+@pytest.mark.parametrize("common", [2, 6, 10])
+@pytest.mark.parametrize("turned", [False, True])
+def test_where_two_run_side_by_side_one_of_them_is_left_out(common, turned):
+    first, second = path((30, 10), (0, 1), 40), path((32, 50 - common), (0, 1), 40)
+    (one,) = joined([first, second[::-1] if turned else second], LOG_RADIUS, RULE)
+    along = np.sort(one[:, 1])
+    assert (along == np.arange(10, 90 - common)).all()
+
+
 def test_at_a_fork_the_straighter_one_goes_on():
     trunk = path((30, 10), (0, 1), 40)
     on, off = path((30, 51), (0, 1), 40), np.array([(31 + k // 4, 51 + k) for k in range(40)])
