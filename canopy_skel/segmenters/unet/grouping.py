@@ -75,7 +75,7 @@ def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
     rule = np.array([grouping.bend_px / STRIDE, grouping.bend_share, grouping.bend_radii])
     least = 0.4 * grouping.least_length_px / STRIDE
     pieces = strands.straight_pieces(cells, starts, field[2], rule, least)
-    paths = joined([cells[begin:end] for begin, end in pieces], field[2], rule)
+    paths = joined([cells[begin:end] for begin, end in pieces], field, rule)
     paths.sort(key=len, reverse=True)
     ends = np.cumsum([0, *map(len, paths)])
     label = np.empty(inside.shape, dtype=np.int32)

@@ -20,7 +20,8 @@ _BACK_CELLS = 12.0
 _BESIDE_CELLS = 3.0
 _BESIDE_TURN_DEG = 25.0
 _BESIDE_RATIO = 0.4
-_TANGENT_CELLS = 12
+_TANGENT_CELLS = 24
+_WAY_CELLS = 12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -35,15 +36,16 @@ class _Ends:
     log_radius: FloatArray
 
 
-def joined(paths: list[I32], log_radius: Float32Array, rule: F64) -> list[I32]:
+def joined(paths: list[I32], field: Float32Array, rule: F64) -> list[I32]:
     """Join paths (N, 2: row and column) end to end, the best aligned first.
 
-    rule: see `strands.bend`; what is joined has no bend.
+    field: (3, h, w) cos 2θ, sin 2θ, log radius in cells. rule: see `strands.bend`; what is joined
+    has no bend.
     """
     paths = list(paths)
     if len(paths) < 2:
         return paths
-    ends = _ends_of(paths, log_radius)
+    ends = _ends_of(paths, field)
     home = np.arange(len(paths))
     free = np.ones(2 * len(paths), dtype=bool)
     for a, b in _candidates(ends):
@@ -51,7 +53,7 @@ def joined(paths: list[I32], log_radius: Float32Array, rule: F64) -> list[I32]:
         if one == other or not (free[a] and free[b]):
             continue
         path = _concatenated(paths[one], paths[other], ends.place[a], ends.place[b])
-        radius = float(np.exp(log_radius[path[:, 0], path[:, 1]].mean()))
+        radius = float(np.exp(field[2, path[:, 0], path[:, 1]].mean()))
         if strands.bend(path, radius, rule) >= 0:
             continue
         paths[one], paths[other] = path, path[:0]
@@ -60,18 +62,29 @@ def joined(paths: list[I32], log_radius: Float32Array, rule: F64) -> list[I32]:
     return [path for path in paths if len(path)]
 
 
-def _ends_of(paths: list[I32], log_radius: Float32Array) -> _Ends:
+def _ends_of(paths: list[I32], field: Float32Array) -> _Ends:
     place, tangent, radius = [], [], []
     for path in paths:
+        log_radius = field[2, path[:, 0], path[:, 1]].mean()
         for own in (path, path[::-1]):
-            inner = own[min(_TANGENT_CELLS, len(own) - 1)]
-            out = (own[0] - inner).astype(np.float64)
             place.append(own[0].astype(np.float64))
-            tangent.append(out / max(float(np.linalg.norm(out)), 1e-9))
-            radius.append(log_radius[path[:, 0], path[:, 1]].mean())
+            tangent.append(_outwards(own[:_TANGENT_CELLS], field))
+            radius.append(log_radius)
     return _Ends(
         place=np.array(place), tangent=np.array(tangent), log_radius=np.array(radius, np.float64)
     )
+
+
+def _outwards(cells: I32, field: Float32Array) -> FloatArray:
+    """Return the direction (row, column) in which the field leaves by the first of some cells.
+
+    The field is steadier than the line: thinning bends its ends.
+    """
+    cosine, sine = field[:2, cells[:, 0], cells[:, 1]].mean(axis=1)
+    angle = 0.5 * np.arctan2(sine, cosine)
+    way = np.array([np.sin(angle), np.cos(angle)])
+    inner = cells[min(_WAY_CELLS, len(cells) - 1)]
+    return -way if way @ (cells[0] - inner) < 0 else way
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -138,7 +151,7 @@ def _concatenated(one: I32, other: I32, from_place: FloatArray, to_place: FloatA
     """Put two paths into one, so that the given ends meet."""
     first = one if np.array_equal(one[-1], from_place) else one[::-1]
     second = other if np.array_equal(other[0], to_place) else other[::-1]
-    way = first[-1] - first[-min(_TANGENT_CELLS, len(first))]
+    way = first[-1] - first[-min(_WAY_CELLS, len(first))]
     if way.any():  # what of the second runs beside the first is left out
         second = second[np.logical_or.accumulate((second - first[-1]) @ way > 0)]
     return np.ascontiguousarray(np.concatenate([first, second]))
