@@ -30,6 +30,7 @@ from canopy_skel.wood import wood_of
 
 MethodName = Literal["canopy", "paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
+DEFAULT_METHOD: MethodName = "canopy"
 JOINERS: frozenset[MethodName] = frozenset({"paper", "mst", "ftsem"})
 """Methods that differ only in how they join the observed skeleton."""
 LONGEST_WAY_M = 5.0
@@ -47,7 +48,7 @@ class MethodConfig:
     Method `canopy` uses `canopy` and `likelihood`, the others everything else.
     """
 
-    name: MethodName = "paper"
+    name: MethodName = DEFAULT_METHOD
     cluster: ClusterConfig = field(default_factory=ClusterConfig)
     spline: SplineConfig = field(default_factory=SplineConfig)
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scenes.leaves import GAP, leafy_view
 from scenes.wood import WOOD, view_from
 
-from canopy_skel.canopy import CanopyConfig, canopy_config_from
+from canopy_skel.canopy import CanopyConfig, CanopyScan, canopy_config_from
 from canopy_skel.confidence import (
     Logistic,
     fit_logistic,
@@ -92,6 +92,22 @@ def test_radii_are_those_of_the_sticks(views):
     assert np.median(document.radius[trunk]) == pytest.approx(0.015, rel=0.15)
 
 
+def test_wood_lies_along_wood_in_view_after_view_and_beside_it_crosswise():
+    scan = CanopyScan(CanopyConfig())
+    segmenter = RecordedSegmenter()
+    one, other = (scan.observe(v, segmenter.segment(v)) for v in (PLAIN, view_from(1, y=0.1)))
+    points, way = one.points_in_base, one.directions
+    seen = other.agreement(points, way)
+    assert seen[:, 0].mean() > 0.95
+    np.testing.assert_array_equal(seen[:, 1], seen[:, 0])
+    assert not seen[:, 2].any()
+    across = np.linalg.svd(way[:, None, :])[2][:, 2]
+    turned = other.agreement(points, across)
+    assert turned[:, 0].mean() > 0.95
+    assert turned[:, 1].mean() < 0.2
+    assert not other.agreement(points + 0.5, way).any()
+
+
 def test_the_order_of_views_and_asking_in_between_do_not_matter_to_the_byte(views):
     expected = to_json(document_of(maker_of(views)))
     for order in permutations(views):
@@ -148,7 +164,8 @@ def test_views_without_wood_give_an_empty_skeleton():
 
 
 def test_other_methods_do_not_notice_the_settings_of_canopy():
-    assert MethodConfig(canopy=CanopyConfig(rooted=True)).sha256() == MethodConfig().sha256()
+    paper = MethodConfig(name="paper")
+    assert replace(paper, canopy=CanopyConfig(rooted=True)).sha256() == paper.sha256()
     rooted = MethodConfig(name="canopy", canopy=CanopyConfig(rooted=True))
     assert rooted.sha256() != MethodConfig(name="canopy").sha256()
 

@@ -112,11 +112,15 @@ def test_json_on_stdout_is_all_there_is_on_stdout(canopy, recording, tmp_path):
 
 
 def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
-    for method in ("canopy", "paper", "mst", "ftsem"):
-        code, _, _ = canopy("replay", recording, "-o", tmp_path / method, "--method", method)
-        assert code == 0
-        document = from_json((tmp_path / method / "sticks.skeleton.json").read_bytes())
-        assert document.method.name == method
+    def made(name, *arguments):
+        assert canopy("replay", recording, "-o", tmp_path / name, *arguments)[0] == 0
+        data = (tmp_path / name / "sticks.skeleton.json").read_bytes()
+        return from_json(data).method.name, data
+
+    methods = ("canopy", "paper", "mst", "ftsem")
+    results = {name: made(name, "--method", name) for name in methods}
+    assert tuple(name for name, _ in results.values()) == methods
+    assert made("default") == results["canopy"]
 
 
 @pytest.mark.parametrize(
