@@ -30,13 +30,15 @@ _MIN_COSINE = 0.82
 class Observation:
     """What one view shows.
 
-    splines: the pieces as polylines. dropped: instances without enough depth. points_in_base,
+    splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
+    instances without enough depth. points_in_base,
     directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 8), score, quality
     of the piece, log of half its area over its length. evidence: the view, ready to be asked.
     cells: (N,) cell numbers ascending, of the points in the order `by_cell` (N,).
     """
 
     splines: list[BranchSpline]
+    fragments: int
     dropped: tuple[int, ...]
     points_in_base: FloatArray
     directions: FloatArray
@@ -98,7 +100,8 @@ def observe(
     cells = cell_keys(points, _NEAR_M)
     by_cell = np.argsort(cells, kind="stable")
     return Observation(
-        splines=[piece.spline for piece in pieces],
+        splines=[piece.spline for piece in pieces if not piece.fragment],
+        fragments=sum(piece.fragment for piece in pieces),
         dropped=tuple(mask.instance for mask in masks if mask.instance not in lifted),
         points_in_base=points,
         directions=directions,

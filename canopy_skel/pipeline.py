@@ -88,10 +88,11 @@ class Extraction:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class _Known:
-    """What is kept of a view."""
+    """What is kept of a view. shown: how many pieces of wood it shows."""
 
     camera_in_base: FloatArray
     splines: list[BranchSpline]
+    shown: int
     instances: int
     rejected: list[RejectedInstance]
 
@@ -154,7 +155,7 @@ class Skeletonizer:
             UsageError: the map would not fit into memory; nothing has changed.
         """
         if view.index in self._known:
-            return len(self._known[view.index].splines)
+            return self._known[view.index].shown
         self._check_place(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
@@ -169,6 +170,7 @@ class Skeletonizer:
         self._known[view.index] = _Known(
             camera_in_base=view.base_from_camera[:3, 3],
             splines=splines,
+            shown=len(splines),
             instances=len(masks),
             rejected=rejected,
         )
@@ -184,6 +186,7 @@ class Skeletonizer:
         self._known[view.index] = _Known(
             camera_in_base=view.base_from_camera[:3, 3],
             splines=seen.splines,
+            shown=len(seen.splines) + seen.fragments,
             instances=len(masks),
             rejected=[
                 RejectedInstance(
@@ -194,7 +197,7 @@ class Skeletonizer:
                 for instance in seen.dropped
             ],
         )
-        return len(seen.splines)
+        return self._known[view.index].shown
 
     def remove_view(self, index: int) -> None:
         """Take a view off again, as if it had never been in.

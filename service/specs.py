@@ -13,9 +13,7 @@ from service.rig import ScanSpec
 _PLAIN_FIELDS = ("tree_id", "segmenter", "speed_mps", "acceleration_mps2", "retakes")
 
 
-def method_config(
-    method: MethodName, voxel_size_m: float, *, rooted: bool = False
-) -> MethodConfig:
+def method_config(method: MethodName, voxel_size_m: float, *, rooted: bool = False) -> MethodConfig:
     """Return the method with a voxel size and all other settings as they come.
 
     rooted: method `canopy` joins everything into one tree, however unsure.

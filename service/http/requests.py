@@ -97,7 +97,9 @@ class ScanBody(PlanBody):
     @model_validator(mode="after")
     def _can_be_rooted(self) -> Self:
         if self.rooted and self.method != "canopy":
-            raise ValueError(f"method {self.method} cannot be rooted; choose canopy or leave it out")
+            raise ValueError(
+                f"method {self.method} cannot be rooted; choose canopy or leave it out"
+            )
         return self
 
 
