@@ -81,14 +81,14 @@ LIMITS = (  # run, figure, at most
 BINS = 10
 INTRODUCTION = """# Method canopy beside method paper
 
-Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points set on
-other trees (the models' file names them; no walnut is among them). Columns are
-explained in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton
-after it, without segmentation, on a busy machine. The number behind a recording is the share of its
-truth that no mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the
-simulated ones; fragments are found by colour, and simulated colours are not an orchard's: the rows
-"masks only" do not depend on them. Rows with *worse masks* (a quarter dropped, a fifth false) and with
-the masks of the built-in *unet* show what a real detector would leave of it.
+Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points set
+on other trees (the models' file names them; no walnut is among them). Columns are explained in
+[metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it, without
+segmentation, on a busy machine. The number behind a recording is the share of its truth that no
+mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated
+ones; fragments are found by colour, and simulated colours are not an orchard's: the rows "masks
+only" do not depend on them. Rows with *worse masks* (a quarter dropped, a fifth false) and with the
+masks of the built-in *unet* show what a real detector would leave of it.
 
 ![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
 

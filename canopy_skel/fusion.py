@@ -22,8 +22,8 @@ class FusionConfig:
     `steps` of a mean shift across the local direction, against the points as observed: Gaussian
     weights of max(`bandwidth_m`, `radius_share` x radius), neighbours within `max_angle_deg`,
     fragments counting `fragment_weight`. Vertices are kept `spacing_m` apart, the best supported
-    first, and joined up to `reach_m`. Dead ends up to `spur_m` at a fork are noise. Rows of vertices
-    that fragments show, whose own directions are poor, are smoothed in `smooth_steps`.
+    first, and joined up to `reach_m`. Dead ends up to `spur_m` at a fork are noise. Rows of
+    vertices that fragments show, whose own directions are poor, are smoothed in `smooth_steps`.
     """
 
     steps: int = 3
@@ -106,7 +106,7 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     stay, edges = prune_spurs(points, edges, config.spur_m)
     return Observed(
         vertices_in_base=_smoothed(
-            points[stay], edges, support[stay, 5] < 0.5, int(config.smooth_steps)
+            points[stay], edges, support[stay, 5] < 0.5, config.smooth_steps
         ),
         directions=directions[stay],
         support=support[stay],

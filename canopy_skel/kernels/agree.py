@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from canopy_skel.kernels.fuse import Floats, Ints, cell_key
 
 AGREEMENT = 3
-"""Columns: beside any point of the other view, along one of an instance, along one of a fragment."""
+"""Columns: beside any point of the other view, along an instance's, along a fragment's."""
 
 
 @njit(cache=True, nogil=True)

@@ -188,6 +188,18 @@ def test_pieces_run_along_the_axes_of_the_sticks():
         assert piece.spline.radius_m == pytest.approx(radius, rel=0.25)
 
 
+def test_a_wall_is_no_branch():
+    wall = np.zeros((240, 320), np.uint16)
+    wall[60:180, 20:300] = 1
+    view = replace(
+        PLAIN, instances=wall, scores=(0.9,), depth_m=np.ones((240, 320), dtype=np.float32)
+    )
+    regions = regions_of_masks(RecordedSegmenter().segment(view))
+    assert pieces_of(view, regions, PieceConfig(), fragments=False) == []
+    thicker = PieceConfig(thickest_m=0.5)
+    assert len(pieces_of(view, regions, thicker, fragments=False)) == 1
+
+
 def test_leaves_that_cover_some_pixels_do_not_move_a_piece():
     view = PLAIN
     depth_m = view.depth_m.copy()
@@ -251,6 +263,8 @@ def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():
     maker = Skeletonizer(Detector(), MethodConfig(name="canopy"))
     assert isinstance(Detector(), WoodDetector)
     assert maker.add_view(replace(PLAIN, instances=masks)) == 3
+    without = maker_of([replace(PLAIN, instances=masks)], use_fragments=False)
+    assert maker.skeleton().voxels == without.skeleton().voxels
 
 
 @settings(deadline=None, max_examples=30)
