@@ -9,8 +9,9 @@ import numpy as np
 from scipy.ndimage import label
 
 from canopy_skel.errors import ViewError
-from canopy_skel.frame import View
+from canopy_skel.frame import Intrinsics, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
+from canopy_skel.kernels.strip import measure
 from canopy_skel.segment import BranchMask
 
 
@@ -46,13 +47,13 @@ class BranchCluster:
     """The visible surface of one slender piece of wood.
 
     points_in_base: (N, 3). camera_in_base: (3,), where it was seen from. confidence: the mask's.
-    margin_m: what the erosion took off each side of the mask.
+    half_width_m: of the whole mask, at the depth of the wood's axis and across the viewing ray.
     """
 
     view_index: int
     instance: int
     confidence: float
-    margin_m: float
+    half_width_m: float
     camera_in_base: FloatArray
     points_in_base: FloatArray
 
@@ -91,7 +92,8 @@ def _clusters_of_mask(
     in_camera = _trusted_points(view, mask, inner, config)
     if len(in_camera) < max(config.min_points, config.min_trusted_share * inner.sum()):
         return [], [(mask.instance, "too few points with trusted depth")]
-    margin_px = 0 if inner is mask.mask else config.erosion_px
+    strip = np.empty(5)
+    measure(mask.mask, strip)
     clusters, reasons = [], []
     for part in connected_parts(in_camera, config.connect_m):
         points = in_camera[part]
@@ -105,7 +107,7 @@ def _clusters_of_mask(
                     view_index=view.index,
                     instance=mask.instance,
                     confidence=mask.confidence,
-                    margin_m=margin_px * float(np.median(points[:, 2])) / view.intrinsics.fx_px,
+                    half_width_m=half_width_m(strip, mask, points, view.intrinsics),
                     camera_in_base=view.base_from_camera[:3, 3],
                     points_in_base=transform_points(view.base_from_camera, points),
                 )
@@ -130,6 +132,27 @@ def _trusted_points(
         follows = follows_profile((pixels - pixels.mean(axis=0)) @ axes[0], 1.0 / depth_m, config)
         u, v, depth_m = u[follows], v[follows], depth_m[follows]
     return view.intrinsics.back_project(u.astype(np.float64), v.astype(np.float64), depth_m)
+
+
+def half_width_m(
+    strip: FloatArray, mask: BranchMask, points: FloatArray, camera: Intrinsics
+) -> float:
+    """Return the radius of the round wood whose outline a mask is, from `strip.measure` of it.
+
+    The outline of a cylinder lies beside its axis, pi/4 of a radius behind its front on average.
+
+    Args:
+        strip: half width in pixels, mean pixel, direction.
+        mask: what was measured.
+        points: its front (N, 3) in the camera frame.
+        camera: that saw it.
+    """
+    half_px, u, v, along_u, along_v = strip.tolist()
+    ray = camera.back_project(np.array([u + mask.left_px]), np.array([v + mask.top_px]), np.ones(1))
+    ray = ray[0] / np.linalg.norm(ray[0])
+    slant = float(ray[1] * along_u - ray[0] * along_v)
+    tangent = half_px / camera.fx_px * np.sqrt(1.0 - slant**2)
+    return float(np.median(points[:, 2]) * tangent / (1.0 - np.pi / 4 * tangent))
 
 
 def follows_profile(along: FloatArray, disparity: FloatArray, config: ClusterConfig) -> BoolArray:
