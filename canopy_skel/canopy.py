@@ -28,7 +28,7 @@ from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_correc
 from canopy_skel.segment import BranchMask
 from canopy_skel.wood import FragmentConfig
 
-POINT_FEATURES = 34
+POINT_FEATURES = 46
 NO_MAP_NATS = 12.0
 """-log p where the likelihood map says nothing."""
 
@@ -195,24 +195,38 @@ def map_cost(likelihood: LikelihoodMap, points_in_base: FloatArray) -> FloatArra
 def point_features(seen: Observation, counts: IntArray, agreed: IntArray) -> FloatArray:
     """Return what speaks for each point being wood (N, POINT_FEATURES): figures and their squares.
 
-    The squares let a model prefer a middle, such as wood neither too thick nor too thin.
+    What all views say counts at the point and as the mean along its piece: a false mask is false
+    as a whole. The squares let a model prefer a middle, such as wood neither too thick nor too
+    thin.
     """
     empty = counts[:, THROUGH] + counts[:, BACKGROUND]
     total = np.maximum(empty + counts[:, WOOD] + counts[:, LEAF], 1)
-    figures = np.column_stack(
+    said = np.column_stack(
         [
-            seen.quality[:, :7],
             np.minimum(empty, 3),
-            np.log1p(counts[:, WOOD]),
-            np.log1p(counts[:, LEAF]),
-            np.log1p(counts[:, HIDDEN]),
             counts[:, WOOD] / total,
-            seen.quality[:, 7],
             np.log1p(agreed),
             agreed[:, 1:].sum(axis=1) / np.maximum(agreed[:, 0], 1),
         ]
     )
+    figures = np.column_stack(
+        [
+            seen.quality,
+            np.log1p(counts[:, WOOD]),
+            np.log1p(counts[:, LEAF]),
+            np.log1p(counts[:, HIDDEN]),
+            said,
+            piece_means(said, seen.piece),
+        ]
+    )
     return np.column_stack([figures, figures**2])
+
+
+def piece_means(values: FloatArray, piece: IntArray) -> FloatArray:
+    """Return of values (N, F) their means (N, F) over the points of the same piece."""
+    points = np.maximum(np.bincount(piece), 1)
+    sums = [np.bincount(piece, weights=column, minlength=len(points)) for column in values.T]
+    return np.column_stack([total / points for total in sums])[piece]
 
 
 def vertex_features(observed: Observed, length_m: FloatArray) -> FloatArray:

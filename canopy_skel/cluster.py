@@ -14,13 +14,17 @@ from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_poin
 from canopy_skel.kernels.strip import measure
 from canopy_skel.segment import BranchMask
 
+FARTHEST_M = 3.0
+"""From the camera. An arm works within a metre or two of it; the next row begins behind that."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClusterConfig:
     """Which points of a mask are trusted.
 
     Masks bleed over edges and depth lies near them, so the mask is eroded by `erosion_px` (unless
-    less than `min_eroded_share` would be left) and depth must lie in [nearest_m, farthest_m].
+    less than `min_eroded_share` would be left) and depth must lie in [nearest_m, farthest_m]: the
+    next row of trees is wood as well, but not this tree's.
     Along a straight piece of wood disparity (1 / depth) is linear in the picture: a robust profile
     (best of `draws` random lines, then reweighted parabolas) is fitted and what is further than
     `tolerance_m` from it in depth is cut; beyond 1.25 m the tolerance grows with the square of the
@@ -33,7 +37,7 @@ class ClusterConfig:
     erosion_px: int = 1
     min_eroded_share: float = 0.5
     nearest_m: float = 0.3
-    farthest_m: float = 5.0
+    farthest_m: float = FARTHEST_M
     draws: int = 60
     tolerance_m: float = 0.02
     min_trusted_share: float = 0.4

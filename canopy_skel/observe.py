@@ -9,7 +9,14 @@ from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels.agree import agreement
 from canopy_skel.kernels.fuse import cell_keys
-from canopy_skel.pieces import Piece, PieceConfig, half_width_px, pieces_of, regions_of_masks
+from canopy_skel.pieces import (
+    Piece,
+    PieceConfig,
+    depth_of,
+    half_width_px,
+    pieces_of,
+    regions_of_masks,
+)
 from canopy_skel.segment import BranchMask
 from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import (
@@ -32,8 +39,8 @@ class Observation:
 
     splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
     instances without enough depth. points_in_base,
-    directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 8), score, quality
-    of the piece, log of half its area over its length. evidence: the view, ready to be asked.
+    directions: (N, 3), along the pieces; piece: (N,), which of them, ascending; radius_m, fragment:
+    (N,); quality: (N, 8), score, quality of the piece, log of half its area over its length. evidence: the view, ready to be asked.
     cells: (N,) cell numbers ascending, of the points in the order `by_cell` (N,).
     """
 
@@ -42,6 +49,7 @@ class Observation:
     dropped: tuple[int, ...]
     points_in_base: FloatArray
     directions: FloatArray
+    piece: IntArray
     radius_m: FloatArray
     fragment: BoolArray
     quality: FloatArray
@@ -87,6 +95,8 @@ def observe(
     pieces = pieces_of(view, regions, pieces_config, fragments=False)
     lifted = {piece.spline.instance for piece in pieces}
     wood = mask_image(view, regions)
+    with np.errstate(invalid="ignore"):  # Wood of other rows says nothing of this tree's.
+        wood &= ~(depth_of(view) > pieces_config.farthest_m)
     if fragments_config is not None:
         if probability is None:
             probability = colour_wood_probability(view, wood, fragments_config)
@@ -105,6 +115,7 @@ def observe(
         dropped=tuple(mask.instance for mask in masks if mask.instance not in lifted),
         points_in_base=points,
         directions=directions,
+        piece=of,
         radius_m=np.array([p.spline.radius_m for p in pieces])[of],
         fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
         quality=np.array([_quality(p) for p in pieces]).reshape(-1, 8)[of],

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
@@ -22,7 +23,7 @@ class PieceConfig:
     """How a region becomes a polyline.
 
     A knot every `knot_px` along it, at most 8 for an instance and `fragment_knots` for a fragment.
-    Depth counts within [nearest_m, farthest_m] and `tolerance_m` of the profile (growing with the
+    Depth counts within [nearest_m, farthest_m] (behind that are other rows) and `tolerance_m` of the profile (growing with the
     square of the distance beyond 1.25 m); a region with depth on less than `min_valid_share` of
     its pixels is dropped, and so is an instance thicker than `thickest_m` in radius, a fragment
     thicker than `thickest_fragment_m`: no branch. centre_shift: by how many radii the visible
@@ -32,7 +33,7 @@ class PieceConfig:
     knot_px: float = 12.0
     fragment_knots: int = 3
     nearest_m: float = 0.3
-    farthest_m: float = 5.0
+    farthest_m: float = FARTHEST_M
     tolerance_m: float = 0.012
     min_valid_share: float = 0.15
     thickest_m: float = 0.15

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
 from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
 from service.outputs import require_writable, write_all
@@ -18,6 +19,9 @@ def scan(
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = DEFAULT_METHOD,
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(SEGMENTERS)}.")] = "recorded",
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
+    farthest: Annotated[
+        float, typer.Option(help="Wood farther from the camera (m) is another tree's.")
+    ] = FARTHEST_M,
     rooted: Annotated[
         bool,
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
@@ -46,6 +50,7 @@ def scan(
             "method": method,
             "voxel_size_m": voxel,
             "segmenter": segmenter,
+            "farthest_m": farthest,
             "rooted": rooted,
         }
         result = run_scan(url, body, show)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.geometry import FloatArray, rotation_from_quaternion, transform_from
 from canopy_skel.pipeline import DEFAULT_METHOD, MethodConfig, MethodName
 from service.rig import PlanRefusedError, ScanSpec
@@ -88,6 +89,15 @@ class ScanBody(PlanBody):
         Literal["recorded", "unet"],
         Field(description="where branch masks come from: the recording, or the learned segmenter"),
     ] = "recorded"
+    farthest_m: Annotated[
+        float,
+        Field(
+            gt=0.3,
+            le=20.0,
+            allow_inf_nan=False,
+            description="wood farther from the camera is another tree's",
+        ),
+    ] = FARTHEST_M
     rooted: Annotated[
         bool,
         Field(description="join everything into one tree, however unsure; method canopy only"),
@@ -141,7 +151,9 @@ def scan_spec(
     return replace(
         plan_spec(body, paths, caps),
         tree_id=body.tree_id,
-        config=method_config(body.method, body.voxel_size_m, rooted=body.rooted),
+        config=method_config(
+            body.method, body.voxel_size_m, farthest_m=body.farthest_m, rooted=body.rooted
+        ),
         segmenter=body.segmenter,
         retakes=body.retakes,
     )

@@ -22,7 +22,9 @@ from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.ends import find_ends
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
+from canopy_skel.geometry import transform_points
 from canopy_skel.links import Candidates, accepted
+from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer
 from canopy_skel.segmenters.recorded import RecordedSegmenter
@@ -198,6 +200,28 @@ def test_a_wall_is_no_branch():
     assert pieces_of(view, regions, PieceConfig(), fragments=False) == []
     thicker = PieceConfig(thickest_m=0.5)
     assert len(pieces_of(view, regions, thicker, fragments=False)) == 1
+
+
+def test_wood_of_the_next_row_is_not_of_this_tree():
+    behind = PLAIN.instances == 3
+    view = replace(PLAIN, depth_m=np.where(behind, np.float32(4.2), PLAIN.depth_m))
+    masks = RecordedSegmenter().segment(view)
+    seen = observe(view, list(masks), PieceConfig(), FragmentConfig())
+    assert (len(seen.splines), seen.dropped) == (2, (3,))
+    assert off_wood(seen.points_in_base).max() < 0.03
+    there = transform_points(
+        view.base_from_camera, back_projected(view, behind & np.isfinite(view.depth_m))
+    )
+    assert not np.any(seen.evidence.classify(there) == WOOD_SEEN)
+    wider = observe(view, list(masks), PieceConfig(farthest_m=5.0), FragmentConfig())
+    assert len(wider.splines) == 3
+
+
+def back_projected(view, chosen):
+    v, u = np.nonzero(chosen)
+    return view.intrinsics.back_project(
+        u.astype(np.float64), v.astype(np.float64), view.depth_m[v, u].astype(np.float64)
+    )
 
 
 def test_leaves_that_cover_some_pixels_do_not_move_a_piece():

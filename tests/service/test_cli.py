@@ -88,6 +88,14 @@ def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path)
     assert set(summary["seconds"]) >= {"read", "cluster", "spline", "likelihood", "initial", "join"}
 
 
+@pytest.mark.parametrize("method", ["canopy", "paper"])
+def test_wood_farther_than_asked_for_is_left_out(canopy, recording, tmp_path, method):
+    code, _, stderr = canopy(
+        "replay", recording, "-o", tmp_path, "--method", method, "--farthest", "0.5"
+    )
+    assert (code, "no branch was found in 9 instances" in stderr) == (0, True)
+
+
 def test_canopy_says_of_every_vertex_how_it_is_known(canopy, recording, tmp_path):
     assert canopy("replay", recording, "-o", tmp_path, "--method", "canopy", "--rooted")[0] == 0
     document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())

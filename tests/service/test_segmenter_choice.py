@@ -31,10 +31,16 @@ def test_a_scan_may_ask_for_one_rooted_tree_and_gets_it_after_a_restart():
     assert spec_from(spec.scan_id, fields_of(spec)).config == spec.config
 
 
+def test_a_scan_may_say_how_far_its_tree_reaches_for_every_method():
+    spec = scan_spec(ScanBody(tree_id="t", path="one", farthest_m=2.5), PATHS, SpeedCaps())
+    assert spec.config.cluster.farthest_m == spec.config.canopy.pieces.farthest_m == 2.5
+    assert spec_from(spec.scan_id, fields_of(spec)).config == spec.config
+
+
 def test_requests_kept_before_trees_could_be_rooted_are_still_understood():
     spec = scan_spec(ScanBody(tree_id="t", path="one"), PATHS, SpeedCaps())
     fields = fields_of(spec)
-    del fields["rooted"]
+    del fields["rooted"], fields["farthest_m"]
     assert spec_from(spec.scan_id, fields).config == spec.config
 
 
