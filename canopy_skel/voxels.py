@@ -53,10 +53,14 @@ class VoxelBlocks:
         """Allocate the blocks that rows (R, 4) of x, y, first z, end z touch."""
         if len(rows) == 0:
             return
-        rows, before = np.ascontiguousarray(rows), self.count
-        self._span(*blocks.bounds(rows))
-        self.count = blocks.allocate(self.top, self.origin, rows, before)
-        if self.count > before:
+        rows = np.ascontiguousarray(rows)
+        self.span(*blocks.bounds(rows))
+        self.number(blocks.allocate(self.top, self.origin, rows, self.count))
+
+    def number(self, count: int) -> None:
+        """Take over the blocks below `count` that were entered into `top`."""
+        before, self.count = self.count, count
+        if count > before:
             fresh = np.argwhere(self.top >= before)
             self.places = grown(self.places, self.count, 0)
             self.neighbours = grown(self.neighbours, self.count, 0)
@@ -73,7 +77,7 @@ class VoxelBlocks:
         inside = np.stack([slots >> 6 & 7, slots >> 3 & 7, slots & 7], axis=1)
         return np.asarray(self.places[slots >> 9] * 8 + inside, dtype=np.int32)
 
-    def _span(self, low: IntArray, high: IntArray) -> None:
+    def span(self, low: IntArray, high: IntArray) -> None:
         """Grow the top table so that it spans blocks [low, high)."""
         if self.top.size:
             low = np.minimum(low, self.origin)

@@ -7,7 +7,7 @@ from scipy.interpolate import make_lsq_spline
 
 from canopy_skel.cluster import BranchCluster, principal_axes
 from canopy_skel.initial import InitialConfig, initial_skeleton
-from canopy_skel.kernels.ellipsoid import UNITS_PER_NAT
+from canopy_skel.kernels.sums import UNITS_PER_NAT
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments
 from canopy_skel.pathsearch import PathSearch
 from canopy_skel.spline import SplineConfig, fit_splines
