@@ -102,13 +102,15 @@ class PathSearch:
             ends,
             parent,
             len(tree),
-            self._levels,
-            self._map.blocks.neighbours,
-            self._map.blocks.places,
-            self._distance,
-            self._previous,
-            self._label,
-            self._marks,
+            (
+                self._levels,
+                self._map.blocks.neighbours,
+                self._map.blocks.places,
+                self._distance,
+                self._previous,
+                self._label,
+                self._marks,
+            ),
         )
         return self._joins(slots, starts, totals)
 
