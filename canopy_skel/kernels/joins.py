@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from canopy_skel.kernels.blocks import CENTRE, SLOTS, beside, key_of
-from canopy_skel.kernels.heap import pop, push
+from canopy_skel.kernels.heap import pop, pop_row, push, push_row, with_room
 from canopy_skel.kernels.search import COSTS, LENGTHS, UNREACHED
 
 Bytes = NDArray[np.uint8]
@@ -212,8 +212,7 @@ def roll_back(
 
 
 @njit(
-    "Tuple((int64[:,::1], int64[:,::1], int64))"
-    f"(int64, int64[:,::1], int64[:,::1], int32[:,::1], int64, int32[::1], {FOREST})",
+    f"int64(int64, int64[::1], int64[:,::1], int32[:,::1], int64, int32[::1], {FOREST})",
     cache=True,
     nogil=True,
 )
@@ -225,10 +224,10 @@ def spread(
     noted: int,
     parent: Int32s,
     forest: Forest,
-) -> tuple[Ints, Ints, int]:
+) -> int:
     """Offer all neighbours of a slot the way through it, and note the borders it is at.
 
-    The journal must have room for 27 more. Returns the heaps and the journal's new count.
+    Heaps and journal must have room for 27 more. Returns the journal's new count.
     """
     levels, neighbours, places, distance, previous, label, marks = forest
     for k in range(27):
@@ -246,14 +245,14 @@ def spread(
                 distance[v], previous[v], label[v] = through, 26 - k, label[u]
             if again:
                 marks[v] |= 1
-                pending = push(pending, through, v, 0)
+                push(pending, through << 32 | v)
         if distance[v] != UNREACHED and (
             root_of(parent, int(label[u])) != root_of(parent, int(label[v]))
         ):
             total = int(distance[u]) + step + int(distance[v])
             lower, way = (u, k) if k > CENTRE else (v, 26 - k)
-            borders = push(borders, total, key_of(places, lower), lower << 5 | way)
-    return pending, borders, noted
+            push_row(borders, total, key_of(places, lower), lower << 5 | way)
+    return noted
 
 
 @njit(f"UniTuple(int64, 2)(int64, int64, int32[::1], {FOREST})", cache=True, nogil=True)
@@ -268,14 +267,14 @@ def joined_by(edge: int, total: int, parent: Int32s, forest: Forest) -> tuple[in
 
 
 @njit(
-    f"Tuple((int64[:,::1], int64))(int64[::1], int64, int64[:,::1], int32[:,::1], int64, {FOREST})",
+    f"int64(int64[::1], int64, int64[::1], int32[:,::1], int64, {FOREST})",
     cache=True,
     nogil=True,
 )
 def make_wood(
     path: Ints, of: int, pending: Ints, journal: Int32s, noted: int, forest: Forest
-) -> tuple[Ints, int]:
-    """Make a path wood of a component, from which ways start; return the heap and the count."""
+) -> int:
+    """Make a path wood of a component, from which ways start; return the journal's new count."""
     _, _, _, distance, previous, label, marks = forest
     for i in range(len(path)):
         w = path[i]
@@ -283,8 +282,8 @@ def make_wood(
             noted = note(w, noted, journal, distance, previous, label, marks)
             distance[w], previous[w], label[w] = 0, CENTRE, of
             marks[w] |= 1
-            pending = push(pending, 0, w, 0)
-    return pending, noted
+            push(pending, w)
+    return noted
 
 
 @njit("int64[:,::1](int64[::1], int64[::1], int64[:,::1])", cache=True, nogil=True)
@@ -316,24 +315,24 @@ def join_all(
     many slots were worked on.
     """
     _, neighbours, _, distance, previous, label, marks = forest
-    borders, pending = heap_of(edges, costs, ends), heap_of(edges[:0], costs[:0], ends[:0])
+    borders, pending = heap_of(edges, costs, ends), np.zeros(1 << 12, dtype=np.int64)
     journal, noted, settled = np.empty((1 << 12, 4), dtype=np.int32), 0, 0
     slots, starts = np.empty(0, dtype=np.int64), np.empty(joins, dtype=np.int64)
     totals, done = np.empty(joins, dtype=np.int64), 0
-    while done < joins and (borders[0, 0] or pending[0, 0]):
-        if pending[0, 0] and (not borders[0, 0] or 2 * pending[1, 0] <= borders[1, 0]):
-            u = pending[1, 1]
+    while done < joins and (borders[0, 0] or pending[0]):
+        if pending[0] and (not borders[0, 0] or 2 * (pending[1] >> 32) <= borders[1, 0]):
+            u = pending[1] & 0xFFFFFFFF
             pop(pending)
             if marks[u] & 1:
                 marks[u] ^= 1
                 settled += 1
-                journal = longer(journal, noted + 27)
-                pending, borders, noted = spread(
-                    u, pending, borders, journal, noted, parent, forest
-                )
+                journal, borders = longer(journal, noted + 27), with_room(borders, 27)
+                if pending[0] + 28 > len(pending):
+                    pending = resized_long(pending, 2 * len(pending))
+                noted = spread(u, pending, borders, journal, noted, parent, forest)
             continue
         total, edge = borders[1, 0], borders[1, 2]
-        pop(borders)
+        pop_row(borders)
         a, b = joined_by(edge, total, parent, forest)
         if a == b:
             continue
@@ -342,6 +341,8 @@ def join_all(
         starts[done], totals[done] = len(slots), total
         slots, done = joined(slots, path), done + 1
         journal = longer(journal, noted + len(path))
-        pending, noted = make_wood(path, min(a, b), pending, journal, noted, forest)
+        if pending[0] + len(path) >= len(pending):
+            pending = resized_long(pending, 2 * (len(pending) + len(path)))
+        noted = make_wood(path, min(a, b), pending, journal, noted, forest)
     roll_back(journal, noted, distance, previous, label, marks)
     return slots, resized_long(starts, done), resized_long(totals, done), settled
