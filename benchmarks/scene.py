@@ -86,7 +86,7 @@ def cluster_of(section, view, instance, eye, random):
         view_index=view,
         instance=instance,
         confidence=float(random.uniform(0.5, 0.99)),
-        margin_m=0.0,
+        half_width_m=section.radius_m,
         camera_in_base=eye,
         points_in_base=points,
     )

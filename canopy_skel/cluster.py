@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from canopy_skel.errors import ViewError
-from canopy_skel.frame import Float32Array, View
+from canopy_skel.frame import Float32Array, Intrinsics, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
 from canopy_skel.kernels import parts, trust
+from canopy_skel.kernels.strip import measure
 from canopy_skel.segment import BranchMask
 
 
@@ -45,13 +46,13 @@ class BranchCluster:
     """The visible surface of one slender piece of wood.
 
     points_in_base: (N, 3). camera_in_base: (3,), where it was seen from. confidence: the mask's.
-    margin_m: what the erosion took off each side of the mask.
+    half_width_m: of the whole mask, at the depth of the wood's axis and across the viewing ray.
     """
 
     view_index: int
     instance: int
     confidence: float
-    margin_m: float
+    half_width_m: float
     camera_in_base: FloatArray
     points_in_base: FloatArray
 
@@ -68,27 +69,24 @@ class RejectedInstance:
 class UsablePixels(NamedTuple):
     """Pixels (N, 3) of u, v and depth; those of mask i from start[i] up to start[i + 1].
 
-    sizes: (M,) how many pixels there are with those without depth. shaved: (M,), whether the mask
-    was eroded.
+    sizes: (M,) how many pixels there are with those without depth.
     """
 
     pixels: FloatArray
     start: IntArray
     sizes: IntArray
-    shaved: BoolArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class _Trusted:
     """Points (N, 3), those of mask i from start[i] up to start[i + 1], and of each mask (M,).
 
-    enough: whether it has points. shaved: whether its edge was taken off.
+    enough: whether it has points.
     """
 
     points_in_camera: FloatArray
     start: IntArray
     enough: BoolArray
-    shaved: BoolArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -123,7 +121,9 @@ def cluster_branches(
     clusters, rejected = [], []
     for i, mask in enumerate(masks):
         reasons = [] if trusted.enough[i] else ["too few points with trusted depth"]
-        margin_px = config.erosion_px if trusted.shaved[i] else 0
+        strip = np.empty(5)
+        if trusted.enough[i]:
+            measure(mask.mask, strip)
         for part in range(*np.searchsorted(slender.mask, (i, i + 1)).tolist()):
             first, end = slender.start[part : part + 2].tolist()
             if end - first < config.min_points:
@@ -136,7 +136,9 @@ def cluster_branches(
                         view_index=view.index,
                         instance=mask.instance,
                         confidence=mask.confidence,
-                        margin_m=margin_px * float(slender.depth_m[part]) / view.intrinsics.fx_px,
+                        half_width_m=half_width_m(
+                            strip, mask, float(slender.depth_m[part]), view.intrinsics
+                        ),
                         camera_in_base=view.base_from_camera[:3, 3],
                         points_in_base=in_base[first:end],
                     )
@@ -173,7 +175,6 @@ def _trusted_points(
         points_in_camera=view.intrinsics.back_project(u, v, z),
         start=np.append(0, np.cumsum(count * enough)),
         enough=enough,
-        shaved=usable.shaved,
     )
 
 
@@ -193,6 +194,25 @@ def usable_pixels(
             config.farthest_m,
         )
     )
+
+
+def half_width_m(strip: FloatArray, mask: BranchMask, depth_m: float, camera: Intrinsics) -> float:
+    """Return the radius of the round wood whose outline a mask is, from `strip.measure` of it.
+
+    The outline of a cylinder lies beside its axis, pi/4 of a radius behind its front on average.
+
+    Args:
+        strip: half width in pixels, mean pixel, direction.
+        mask: what was measured.
+        depth_m: of its front, the median.
+        camera: that saw it.
+    """
+    half_px, u, v, along_u, along_v = strip.tolist()
+    ray = camera.back_project(np.array([u + mask.left_px]), np.array([v + mask.top_px]), np.ones(1))
+    ray = ray[0] / np.linalg.norm(ray[0])
+    slant = float(ray[1] * along_u - ray[0] * along_v)
+    tangent = half_px / camera.fx_px * np.sqrt(1.0 - slant**2)
+    return float(depth_m * tangent / (1.0 - np.pi / 4 * tangent))
 
 
 def follow_profiles(usable: UsablePixels, config: ClusterConfig) -> BoolArray:

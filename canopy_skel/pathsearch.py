@@ -241,10 +241,7 @@ class PathSearch:
 
 
 def add_paths(graph: SkeletonGraph, joins: list[Join], likelihood: LikelihoodMap) -> SkeletonGraph:
-    """Add the paths as occluded vertices at voxel centres, as thick as the thinner of their ends.
-
-    Where a twig meets the trunk it is the twig that goes on under the leaves.
-    """
+    """Add the paths as occluded vertices at voxel centres, tapering from end to end."""
     if not joins:
         return graph
     voxel_size_m = likelihood.voxel_size_m
@@ -257,11 +254,12 @@ def add_paths(graph: SkeletonGraph, joins: list[Join], likelihood: LikelihoodMap
     added = []
     for join in joins:
         path = [tuple(voxel) for voxel in join.voxels.tolist()]
-        thinner = min(radius[vertex_at[path[0]]], radius[vertex_at[path[-1]]])
-        for voxel in path[1:-1]:
+        ends_m = radius[vertex_at[path[0]]], radius[vertex_at[path[-1]]]
+        taper_m = np.linspace(*ends_m, len(path)).tolist()
+        for voxel, radius_m in zip(path[1:-1], taper_m[1:-1], strict=True):
             if voxel not in vertex_at:
                 vertex_at[voxel] = len(radius)
-                radius.append(thinner)
+                radius.append(radius_m)
                 added.append(voxel)
         # The ways of a preview may run together for a while.
         steps = pairwise(vertex_at[voxel] for voxel in path)

@@ -32,7 +32,7 @@ def is_inner(mask: Bools, box: Ints, v: int, u: int, margin: int) -> bool:
 
 
 @njit(
-    "Tuple((float64[:,::1], int64[::1], int64[::1], boolean[::1]))(boolean[::1], int64[:,::1],"
+    "Tuple((float64[:,::1], int64[::1], int64[::1]))(boolean[::1], int64[:,::1],"
     " Array(float32, 2, 'C', readonly=True), int64, float64, float64, float64)",
     cache=True,
     nogil=True,
@@ -45,18 +45,18 @@ def pixels_of(
     min_share: float,
     nearest_m: float,
     farthest_m: float,
-) -> tuple[Floats, Ints, Ints, Bools]:
+) -> tuple[Floats, Ints, Ints]:
     """Shave `margin` pixels off masks; return (N, 3) u, v and depth of what has usable depth.
 
     `masks`: their boxes (M, 4) of left, top, height and width, one after the other. Those of which
-    less than `min_share` would be left stay as they are. Also returns where each mask starts, how
-    many pixels it has with and without usable depth, and whether it was shaved.
+    less than `min_share` would be left stay as they are. Also returns where each mask starts and
+    how many pixels it has with and without usable depth.
     """
     room = 0
     for i in range(len(masks)):
         room += masks[i]
     pixels, start = np.empty((room, 3)), np.zeros(len(boxes) + 1, dtype=np.int64)
-    sizes, shaved = np.zeros(len(boxes), dtype=np.int64), np.zeros(len(boxes), dtype=np.bool_)
+    sizes = np.zeros(len(boxes), dtype=np.int64)
     inner = np.empty(len(masks), dtype=np.bool_)
     at = count = 0
     for i in range(len(boxes)):
@@ -67,10 +67,10 @@ def pixels_of(
             inner[n] = mask[n] and is_inner(mask, boxes[i], n // width, n % width, margin)
             whole += mask[n]
             kept += inner[n]
-        shaved[i] = kept >= min_share * whole
-        sizes[i] = kept if shaved[i] else whole
+        shaved = kept >= min_share * whole
+        sizes[i] = kept if shaved else whole
         for n in range(height * width):
-            if inner[n] if shaved[i] else mask[n]:
+            if inner[n] if shaved else mask[n]:
                 u, v = left + n % width, top + n // width
                 z = float(depth_m[v, u])
                 if nearest_m <= z <= farthest_m:
@@ -78,7 +78,7 @@ def pixels_of(
                     count += 1
         at += height * width
         start[i + 1] = count
-    return pixels[:count].copy(), start, sizes, shaved
+    return pixels[:count].copy(), start, sizes
 
 
 @njit("float64(float64[::1])", cache=True, nogil=True)

@@ -149,7 +149,7 @@ def test_splines_are_those_of_the_library(shape):
         view_index=0,
         instance=1,
         confidence=0.8,
-        margin_m=0.0,
+        half_width_m=0.0,
         camera_in_base=np.array([0.0, 0.0, -1.0]),
         points_in_base=points,
     )

@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import label
 
-from canopy_skel.cluster import principal_axes
+from canopy_skel.cluster import half_width_m, principal_axes
 from canopy_skel.geometry import transform_points
+from canopy_skel.kernels.strip import measure
 
 
 def clusters_of_mask(view, mask, config):
@@ -22,9 +23,10 @@ def clusters_of_mask(view, mask, config):
         elif flatness(points) > config.max_flatness:
             reasons.append("not slender")
         else:
-            margin_px = 0 if inner is mask.mask else config.erosion_px
-            margin_m = margin_px * float(np.median(points[:, 2])) / view.intrinsics.fx_px
-            clusters.append((transform_points(view.base_from_camera, points), margin_m))
+            strip = np.empty(5)
+            measure(mask.mask, strip)
+            width = half_width_m(strip, mask, float(np.median(points[:, 2])), view.intrinsics)
+            clusters.append((transform_points(view.base_from_camera, points), width))
     return clusters, reasons
 
 
