@@ -30,7 +30,7 @@ from canopy_skel.spline import BranchSpline, fit_splines
 from canopy_skel.strands import StrandMap, Strands, sample_segments
 from drivers.stereo import with_depth
 
-CONFIG = MethodConfig()
+CONFIG = MethodConfig(name="paper")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from canopy_skel.canopy import CanopyConfig
 from canopy_skel.likelihood import LikelihoodConfig
 from canopy_skel.pipeline import MethodConfig, MethodName
 from service.rig import ScanSpec
@@ -12,9 +13,16 @@ from service.rig import ScanSpec
 _PLAIN_FIELDS = ("tree_id", "segmenter", "speed_mps", "acceleration_mps2", "retakes")
 
 
-def method_config(method: MethodName, voxel_size_m: float) -> MethodConfig:
-    """Return the method with a voxel size and all other settings as they come."""
-    return MethodConfig(name=method, likelihood=LikelihoodConfig(voxel_size_m=voxel_size_m))
+def method_config(method: MethodName, voxel_size_m: float, *, rooted: bool = False) -> MethodConfig:
+    """Return the method with a voxel size and all other settings as they come.
+
+    rooted: method `canopy` joins everything into one tree, however unsure.
+    """
+    return MethodConfig(
+        name=method,
+        likelihood=LikelihoodConfig(voxel_size_m=voxel_size_m),
+        canopy=CanopyConfig(rooted=rooted),
+    )
 
 
 def fields_of(spec: ScanSpec) -> dict[str, Any]:
@@ -23,6 +31,7 @@ def fields_of(spec: ScanSpec) -> dict[str, Any]:
         "waypoints": [pose.tolist() for pose in spec.waypoints],
         "method": spec.config.name,
         "voxel_size_m": spec.config.likelihood.voxel_size_m,
+        "rooted": spec.config.canopy.rooted,
     }
 
 
@@ -31,6 +40,11 @@ def spec_from(scan_id: str, fields: Mapping[str, Any]) -> ScanSpec:
     return ScanSpec(
         scan_id=scan_id,
         waypoints=tuple(np.array(pose, dtype=np.float64) for pose in fields["waypoints"]),
-        config=method_config(fields["method"], fields["voxel_size_m"]),
+        config=method_config(
+            fields["method"],
+            fields["voxel_size_m"],
+            # Requests kept by a service that could not root lack it.
+            rooted=fields.get("rooted", False),
+        ),
         **{name: fields[name] for name in _PLAIN_FIELDS},
     )

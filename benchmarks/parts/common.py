@@ -13,7 +13,7 @@ from canopy_skel.pipeline import MethodConfig
 from canopy_skel.spline import fit_splines
 from canopy_skel.strands import StrandMap
 
-CONFIG = MethodConfig()
+CONFIG = MethodConfig(name="paper")
 
 
 @cache

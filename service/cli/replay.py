@@ -12,7 +12,7 @@ from canopy_skel.canopy import CanopyConfig
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.exports import FORMATS
 from canopy_skel.likelihood import LikelihoodConfig
-from canopy_skel.pipeline import METHODS, MethodConfig
+from canopy_skel.pipeline import DEFAULT_METHOD, METHODS, MethodConfig
 from service.cli.shell import AsJson, Exit, Out, complain, progress_bars, stderr, topic_options
 from service.doctor import available_memory_bytes
 from service.outputs import require_writable
@@ -26,7 +26,7 @@ MOST_MAP_MEMORY = 3 << 30
 def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = DEFAULT_METHOD,
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")] = "recorded",
     weights: Annotated[Path | None, typer.Option(help="Weights of the segmenter (.pt).")] = None,
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
