@@ -6,7 +6,6 @@ python benchmarks/canopy_table.py REC... --output docs/results/canopy.md --cache
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +16,30 @@ from canopy_skel.fitting import truth_points
 from canopy_skel.metrics import score
 from canopy_skel.pipeline import MethodConfig, Skeletonizer
 from canopy_skel.recording import read_recording
-from canopy_skel.segmenters.recorded import RecordedSegmenter
 from drivers.stereo import with_depth
+from service.experiment.segmenters import segmenter_named
 
+PAPER, CANOPY = MethodConfig(name="paper"), MethodConfig(name="canopy")
 RUNS = {
-    "paper": MethodConfig(name="paper"),
-    "masks": MethodConfig(name="canopy", canopy=CanopyConfig(use_fragments=False)),
-    "fragments": MethodConfig(name="canopy"),
+    "paper": ("recorded", PAPER),
+    "masks": (
+        "recorded",
+        MethodConfig(name="canopy", canopy=CanopyConfig(use_fragments=False)),
+    ),
+    "fragments": ("recorded", CANOPY),
 }
+WORSE = {
+    "paper, worse masks": ("drop25+false20", PAPER),
+    "canopy, worse masks": ("drop25+false20", CANOPY),
+    "paper, unet": ("unet", PAPER),
+    "canopy, unet": ("unet", CANOPY),
+}
+"""Runs on recordings of medium foliage with what a real detector would see."""
 LABELS = {
     "paper": "paper",
     "masks": "canopy, masks only",
     "fragments": "canopy, colour fragments",
+    **{name: name for name in WORSE},
 }
 FIGURES = {
     "precision": "P",
@@ -46,14 +57,38 @@ FIGURES = {
     "components": "parts",
     "view_ms": "ms/view",
 }
+M, F = "masks", "fragments"
+GOALS = (  # run, figure, at least: a number or a multiple of what paper has
+    (M, "precision", (0.95, 0.92, 0.91)),
+    (M, "occ_precision", (0.78, 0.79, 0.82)),
+    (M, "recall", (0.78, "1.12", "1.2")),
+    (M, "recall_unmasked", ("1.6", "1.7", "1.7")),
+    (F, "precision", (0.94, 0.90, 0.92)),
+    (F, "recall", (0.88, 0.80, "1.5")),
+    (F, "recall_unmasked", (0.64, 0.60, "3")),
+    (M, "recall_hidden", ("1.4", "1.4", "1.4")),
+    (F, "recall_hidden", ("2", "2", "2")),
+    *((run, "precision_directional", (0.93, 0.93, 0.93)) for run in (M, F)),
+    *((run, "joined", (0.8, 0.8, 0.8)) for run in (M, F)),
+)
+LIMITS = (  # run, figure, at most
+    *((run, "ece", (0.03, 0.05, 0.08)) for run in (M, F)),
+    *((run, "ece_occluded", (0.12, 0.10, 0.10)) for run in (M, F)),
+    *((run, "length_ratio", (1.1, 1.1, 1.1)) for run in (M, F)),
+    *((run, "radius_error_median", (0.18, 0.18, 0.18)) for run in (M, F)),
+    *((run, "view_ms", (None, 300, None)) for run in (M, F)),
+)
 BINS = 10
 INTRODUCTION = """# Method canopy beside method paper
 
-Made by `benchmarks/canopy_table.py` from simulated trees that nothing was fitted to. Columns are
-explained in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton
-after it, without segmentation. The number behind a recording is the share of its truth that no mask
-covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated ones;
-fragments are found by colour, and simulated colours are not an orchard's.
+Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points set
+on other trees (the models' file names them; no walnut is among them). Columns are explained in
+[metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it, without
+segmentation, on a busy machine. The number behind a recording is the share of its truth that no
+mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated
+ones; fragments are found by colour, and simulated colours are not an orchard's: the rows "masks
+only" do not depend on them. Rows with *worse masks* (a quarter dropped, a fifth false) and with the
+masks of the built-in *unet* show what a real detector would leave of it.
 
 ![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
 
@@ -66,10 +101,18 @@ def main():
     parser.add_argument("recordings", type=Path, nargs="+")
     parser.add_argument("--output", type=Path)
     parser.add_argument("--cache", type=Path, required=True, help="where finished figures are kept")
+    parser.add_argument("--worse", action="store_true", help="worse masks too, at medium foliage")
     arguments = parser.parse_args()
     arguments.cache.mkdir(parents=True, exist_ok=True)
-    results = {path.stem: figures_of(path, arguments.cache) for path in arguments.recordings}
-    page = "\n".join([*class_tables(results), *recording_table(results)]) + "\n"
+    results = {}
+    for path in arguments.recordings:
+        results[path.stem] = figures_of(path, arguments.cache, RUNS)
+    for path in arguments.recordings if arguments.worse else ():
+        if class_of(results[path.stem]["unmasked"]) == "medium":
+            results[path.stem] = figures_of(path, arguments.cache, [*RUNS, *WORSE])
+    page = (
+        "\n".join([*goal_table(results), *class_tables(results), *recording_table(results)]) + "\n"
+    )
     if arguments.output:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(INTRODUCTION + page)
@@ -79,23 +122,26 @@ def main():
     print(page)
 
 
-def figures_of(path, cache):
-    """Return the figures of all runs of one recording, from the cache where they are there."""
+def figures_of(path, cache, names):
+    """Return the figures of some runs of one recording, from the cache where they are there."""
     kept = cache / f"{path.stem}.json"
-    if kept.exists():
-        return json.loads(kept.read_text())
+    results = json.loads(kept.read_text()) if kept.exists() else {}
+    if all(name in results for name in names):
+        return results
     recording = read_recording(path)
     views = [with_depth(view) for view in recording.views()]
     truth = from_json(recording.ground_truth)
-    results = {"unmasked": unmasked_share(truth)}
-    for name, config in RUNS.items():
-        results[name] = run(views, truth, config)
-    kept.write_text(json.dumps(results))
+    results["unmasked"] = unmasked_share(truth)
+    for name in names:
+        if name not in results:
+            results[name] = run(views, truth, *(RUNS | WORSE)[name])
+            kept.write_text(json.dumps(results))
     return results
 
 
-def run(views, truth, config):
-    maker = Skeletonizer(RecordedSegmenter(), replace(config))
+def run(views, truth, segmenter, config):
+    seen = Once(segmenter_named(segmenter), views)
+    maker = Skeletonizer(seen, config)
     for view in views[:-1]:
         maker.add_view(view)
     started = time.process_time()
@@ -113,6 +159,16 @@ def run(views, truth, config):
         "view_ms": view_ms,
         "reliability": reliability(document, truth),
     }
+
+
+class Once:
+    """A segmenter that has seen all views already, so that its time does not count."""
+
+    def __init__(self, inner, views):
+        self.masks = {view.index: inner.segment(view) for view in views}
+
+    def segment(self, view):
+        return self.masks[view.index]
 
 
 def reliability(document, truth):
@@ -166,14 +222,50 @@ def reliability_diagram(results, run_name):
     )
 
 
+def goal_table(results):
+    """Yield a table of what was asked, what was measured, and whether that is enough."""
+    yield "## Goals"
+    yield ""
+    yield "Asked → measured, mean of the class; × is times what `paper` has."
+    yield ""
+    yield "| | " + " | ".join(CLASSES) + " |"
+    yield "|---|" + "---|" * len(CLASSES)
+    means = {}
+    for name in CLASSES:
+        chosen = [r for r in results.values() if class_of(r["unmasked"]) == name]
+        means[name] = {run_name: mean_figures(chosen, run_name) for run_name in RUNS}
+    for sign, table in (("≥", GOALS), ("≤", LIMITS)):
+        for run_name, figure, asked in table:
+            cells = [
+                goal_cell(means[name], run_name, figure, limit, sign)
+                for name, limit in zip(CLASSES, asked, strict=True)
+            ]
+            yield f"| {LABELS[run_name]}: {FIGURES[figure]} | " + " | ".join(cells) + " |"
+    yield ""
+
+
+def goal_cell(means, run_name, figure, limit, sign):
+    value, paper = means[run_name][figure], means["paper"][figure]
+    if limit is None or value is None:
+        return ""
+    asked = float(limit)
+    if isinstance(limit, str):
+        value, limit = value / paper, f"{limit} ×"
+    good = value >= asked if sign == "≥" else value <= asked
+    digits = 0 if figure == "view_ms" else 3
+    return f"{sign} {limit} → {value:.{digits}f} {'reached' if good else '**missed**'}"
+
+
 def class_tables(results):
     for name in CLASSES:
         chosen = [r for r in results.values() if class_of(r["unmasked"]) == name]
         yield f"## {name}: {len(chosen)} recordings"
         yield ""
         yield from header("method")
-        for run_name in RUNS:
-            yield row(LABELS[run_name], mean_figures(chosen, run_name))
+        for run_name in RUNS | WORSE:
+            seen = [result for result in chosen if run_name in result]
+            if seen:
+                yield row(LABELS[run_name], mean_figures(seen, run_name))
         yield ""
 
 

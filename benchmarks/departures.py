@@ -49,7 +49,7 @@ def main():
         "|---|" + "---|" * len(scans),
     ]
     for name, changes in CHANGES.items():
-        config = changed(MethodConfig(), changes)
+        config = changed(MethodConfig(name="paper"), changes)
         cells = [figures(views, truth, config) for views, truth in scans.values()]
         setting = ", ".join(f"`{key} = {value}`" for key, value in changes.items())
         lines.append(f"| {name} {setting} | " + " | ".join(cells) + " |")

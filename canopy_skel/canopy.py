@@ -19,6 +19,7 @@ from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.kernels.agree import AGREEMENT
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
 from canopy_skel.observe import Observation, observe
@@ -27,7 +28,7 @@ from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_correc
 from canopy_skel.segment import BranchMask
 from canopy_skel.wood import FragmentConfig
 
-POINT_FEATURES = 13
+POINT_FEATURES = 46
 NO_MAP_NATS = 12.0
 """-log p where the likelihood map says nothing."""
 
@@ -50,8 +51,8 @@ class CanopyConfig:
     extensions: ExtensionConfig = field(default_factory=ExtensionConfig)
     use_fragments: bool = True
     min_point: float = 0.5
-    min_fragment_point: float = 0.65
-    min_piece_m: float = 0.03
+    min_fragment_point: float = 0.5
+    min_piece_m: float = 0.015
     rooted: bool = False
 
 
@@ -83,6 +84,7 @@ class CanopyScan:
         self.config = config
         self._seen: dict[int, Observation] = {}
         self._counts: dict[int, IntArray] = {}
+        self._agreed: dict[int, IntArray] = {}
 
     def observe(
         self, view: View, masks: Sequence[BranchMask], probability: Float32Array | None = None
@@ -96,9 +98,13 @@ class CanopyScan:
 
     def add(self, index: int, seen: Observation) -> None:
         """Take a view in: all points are asked in it, and its points in all views."""
+        agreed = np.zeros((len(seen.points_in_base), AGREEMENT), dtype=np.int64)
         for other, points in self._seen.items():
             self._counts[other] += counted(seen.evidence.classify(points.points_in_base))
+            self._agreed[other] += seen.agreement(points.points_in_base, points.directions)
+            agreed += points.agreement(seen.points_in_base, seen.directions)
         self._seen[index] = seen
+        self._agreed[index] = agreed
         self._counts[index] = count_evidence(
             seen.points_in_base, [one.evidence for one in self._seen.values()]
         )
@@ -108,9 +114,10 @@ class CanopyScan:
         gone = self._seen.pop(index, None)
         if gone is None:
             return
-        del self._counts[index]
+        del self._counts[index], self._agreed[index]
         for other, points in self._seen.items():
             self._counts[other] -= counted(gone.evidence.classify(points.points_in_base))
+            self._agreed[other] -= gone.agreement(points.points_in_base, points.directions)
 
     def evidence(self, points_in_base: FloatArray) -> IntArray:
         """Return how many views say what (N, 6) of points (N, 3)."""
@@ -123,7 +130,7 @@ class CanopyScan:
         """
         order = sorted(self._seen)
         seen = [self._seen[i] for i in order]
-        features = [point_features(self._seen[i], self._counts[i]) for i in order]
+        features = [point_features(self._seen[i], self._counts[i], self._agreed[i]) for i in order]
         view = [np.full(len(s.points_in_base), n, dtype=np.int64) for n, s in enumerate(seen)]
         return (
             np.concatenate([np.zeros((0, 3)), *(s.points_in_base for s in seen)]),
@@ -185,21 +192,41 @@ def map_cost(likelihood: LikelihoodMap, points_in_base: FloatArray) -> FloatArra
     return np.asarray(-np.log(np.maximum(probability, np.exp(-NO_MAP_NATS))))
 
 
-def point_features(seen: Observation, counts: IntArray) -> FloatArray:
-    """Return what speaks for each point being wood (N, 13)."""
+def point_features(seen: Observation, counts: IntArray, agreed: IntArray) -> FloatArray:
+    """Return what speaks for each point being wood (N, POINT_FEATURES): figures and their squares.
+
+    What all views say counts at the point and as the mean along its piece: a false mask is false
+    as a whole. The squares let a model prefer a middle, such as wood neither too thick nor too
+    thin.
+    """
     empty = counts[:, THROUGH] + counts[:, BACKGROUND]
     total = np.maximum(empty + counts[:, WOOD] + counts[:, LEAF], 1)
-    return np.column_stack(
+    said = np.column_stack(
         [
-            seen.quality[:, :7],
             np.minimum(empty, 3),
+            counts[:, WOOD] / total,
+            np.log1p(agreed),
+            agreed[:, 1:].sum(axis=1) / np.maximum(agreed[:, 0], 1),
+        ]
+    )
+    figures = np.column_stack(
+        [
+            seen.quality,
             np.log1p(counts[:, WOOD]),
             np.log1p(counts[:, LEAF]),
             np.log1p(counts[:, HIDDEN]),
-            counts[:, WOOD] / total,
-            seen.quality[:, 7],
+            said,
+            piece_means(said, seen.piece),
         ]
     )
+    return np.column_stack([figures, figures**2])
+
+
+def piece_means(values: FloatArray, piece: IntArray) -> FloatArray:
+    """Return of values (N, F) their means (N, F) over the points of the same piece."""
+    points = np.maximum(np.bincount(piece), 1)
+    sums = [np.bincount(piece, weights=column, minlength=len(points)) for column in values.T]
+    return np.column_stack([total / points for total in sums])[piece]
 
 
 def vertex_features(observed: Observed, length_m: FloatArray) -> FloatArray:

@@ -22,18 +22,20 @@ class FusionConfig:
     `steps` of a mean shift across the local direction, against the points as observed: Gaussian
     weights of max(`bandwidth_m`, `radius_share` x radius), neighbours within `max_angle_deg`,
     fragments counting `fragment_weight`. Vertices are kept `spacing_m` apart, the best supported
-    first, and joined up to `reach_m`. Dead ends up to `spur_m` at a fork are noise.
+    first, and joined up to `reach_m`. Dead ends up to `spur_m` at a fork are noise. Rows of
+    vertices that fragments show, whose own directions are poor, are smoothed in `smooth_steps`.
     """
 
     steps: int = 3
     bandwidth_m: float = 0.012
     radius_share: float = 0.5
-    max_angle_deg: float = 45.0
+    max_angle_deg: float = 60.0
     fragment_weight: float = 0.5
     seed_m: float = 0.004
     spacing_m: float = 0.006
     reach_m: float = 0.017
     spur_m: float = 0.02
+    smooth_steps: int = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -103,7 +105,9 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     edges = forest(points, directions, config.reach_m)
     stay, edges = prune_spurs(points, edges, config.spur_m)
     return Observed(
-        vertices_in_base=points[stay],
+        vertices_in_base=_smoothed(
+            points[stay], edges, support[stay, 5] < 0.5, config.smooth_steps
+        ),
         directions=directions[stay],
         support=support[stay],
         edges=edges,
@@ -123,6 +127,18 @@ def forest(points: FloatArray, directions: FloatArray, reach_m: float) -> IntArr
         coo_array((weights, pairs.T), shape=(len(points),) * 2).tocsr()
     ).tocoo()
     return np.stack([tree.row, tree.col], axis=1).astype(np.int64)
+
+
+def _smoothed(points: FloatArray, edges: IntArray, chosen: BoolArray, steps: int) -> FloatArray:
+    """Move the chosen points (V,) with two neighbours halfway to the middle of these."""
+    n = len(points)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    adjacency = coo_array((np.ones(len(both)), both.T), shape=(n, n)).tocsr()
+    free = chosen & (np.bincount(edges.ravel(), minlength=n) == 2)
+    for _ in range(steps):
+        middle = 0.5 * (adjacency @ points)
+        points = np.where(free[:, None], 0.5 * (points + middle), points)
+    return points
 
 
 def _seeds(seen: Observations, weight: FloatArray, seed_m: float) -> IntArray:

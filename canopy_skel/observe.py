@@ -6,8 +6,17 @@ import numpy as np
 
 from canopy_skel.evidence import ViewEvidence, evidence_of
 from canopy_skel.frame import Float32Array, View
-from canopy_skel.geometry import BoolArray, FloatArray
-from canopy_skel.pieces import Piece, PieceConfig, half_width_px, pieces_of, regions_of_masks
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.kernels.agree import agreement
+from canopy_skel.kernels.fuse import cell_keys
+from canopy_skel.pieces import (
+    Piece,
+    PieceConfig,
+    depth_of,
+    half_width_px,
+    pieces_of,
+    regions_of_masks,
+)
 from canopy_skel.segment import BranchMask
 from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import (
@@ -19,25 +28,52 @@ from canopy_skel.wood import (
 )
 
 SAMPLE_M = 0.005
+_NEAR_M = 0.02
+_ACROSS_M = 0.012
+_MIN_COSINE = 0.82
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Observation:
     """What one view shows.
 
-    splines: the pieces as polylines. dropped: instances without enough depth. points_in_base,
-    directions: (N, 3), along the pieces; radius_m, fragment: (N,); quality: (N, 8), score, quality
-    of the piece, log of half its area over its length. evidence: the view, ready to be asked.
+    splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
+    instances without enough depth. points_in_base,
+    directions: (N, 3), along the pieces; piece: (N,), which of them, ascending; radius_m, fragment:
+    (N,); quality: (N, 8), score, quality of the piece, log of half its area over its length. evidence: the view, ready to be asked.
+    cells: (N,) cell numbers ascending, of the points in the order `by_cell` (N,).
     """
 
     splines: list[BranchSpline]
+    fragments: int
     dropped: tuple[int, ...]
     points_in_base: FloatArray
     directions: FloatArray
+    piece: IntArray
     radius_m: FloatArray
     fragment: BoolArray
     quality: FloatArray
     evidence: ViewEvidence
+    cells: IntArray
+    by_cell: IntArray
+
+    def agreement(self, points_in_base: FloatArray, directions: FloatArray) -> IntArray:
+        """Say of points (N, 3) of another view what this view has beside and along them (N, 3).
+
+        Wood lies along wood in view after view; leaves taken for wood seldom do.
+        """
+        return agreement(
+            points_in_base,
+            directions,
+            self.points_in_base[self.by_cell],
+            self.directions[self.by_cell],
+            self.fragment[self.by_cell],
+            self.cells,
+            _NEAR_M,
+            _ACROSS_M,
+            _NEAR_M,
+            _MIN_COSINE,
+        )
 
 
 def observe(
@@ -59,6 +95,8 @@ def observe(
     pieces = pieces_of(view, regions, pieces_config, fragments=False)
     lifted = {piece.spline.instance for piece in pieces}
     wood = mask_image(view, regions)
+    with np.errstate(invalid="ignore"):  # Wood of other rows says nothing of this tree's.
+        wood &= ~(depth_of(view) > pieces_config.farthest_m)
     if fragments_config is not None:
         if probability is None:
             probability = colour_wood_probability(view, wood, fragments_config)
@@ -69,15 +107,21 @@ def observe(
         pieces += pieces_of(view, fragments, pieces_config, fragments=True)
         wood[fragments.v, fragments.u] = True
     points, directions, of = sampled(pieces)
+    cells = cell_keys(points, _NEAR_M)
+    by_cell = np.argsort(cells, kind="stable")
     return Observation(
-        splines=[piece.spline for piece in pieces],
+        splines=[piece.spline for piece in pieces if not piece.fragment],
+        fragments=sum(piece.fragment for piece in pieces),
         dropped=tuple(mask.instance for mask in masks if mask.instance not in lifted),
         points_in_base=points,
         directions=directions,
+        piece=of,
         radius_m=np.array([p.spline.radius_m for p in pieces])[of],
         fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
         quality=np.array([_quality(p) for p in pieces]).reshape(-1, 8)[of],
         evidence=evidence_of(view, wood),
+        cells=cells[by_cell],
+        by_cell=by_cell,
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
@@ -22,18 +23,21 @@ class PieceConfig:
     """How a region becomes a polyline.
 
     A knot every `knot_px` along it, at most 8 for an instance and `fragment_knots` for a fragment.
-    Depth counts within [nearest_m, farthest_m] and `tolerance_m` of the profile (growing with the
+    Depth counts within [nearest_m, farthest_m] (behind that are other rows) and `tolerance_m` of the profile (growing with the
     square of the distance beyond 1.25 m); a region with depth on less than `min_valid_share` of
-    its pixels is dropped. centre_shift: by how many radii the visible surface is moved away from
-    the camera.
+    its pixels is dropped, and so is an instance thicker than `thickest_m` in radius, a fragment
+    thicker than `thickest_fragment_m`: no branch. centre_shift: by how many radii the visible
+    surface is moved away from the camera.
     """
 
     knot_px: float = 12.0
     fragment_knots: int = 3
     nearest_m: float = 0.3
-    farthest_m: float = 5.0
+    farthest_m: float = FARTHEST_M
     tolerance_m: float = 0.012
     min_valid_share: float = 0.15
+    thickest_m: float = 0.15
+    thickest_fragment_m: float = 0.04
     centre_shift: float = np.pi / 4
 
 
@@ -102,11 +106,14 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         config.tolerance_m,
         config.min_valid_share,
     )
+    thickest_m = config.thickest_fragment_m if fragments else config.thickest_m
     pieces = []
     for i in np.flatnonzero(counts).tolist():
         u, v, disparity = knots[i, : counts[i]].T
         points = camera.back_project(u, v, 1.0 / disparity)
         radius_m = half_width_px(quality[i]) / camera.fx_px / float(disparity.mean())
+        if radius_m > thickest_m:
+            continue
         points = points + config.centre_shift * radius_m * away_across(points)
         spline = BranchSpline(
             view_index=view.index,

@@ -30,6 +30,7 @@ from canopy_skel.wood import wood_of
 
 MethodName = Literal["canopy", "paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
+DEFAULT_METHOD: MethodName = "canopy"
 JOINERS: frozenset[MethodName] = frozenset({"paper", "mst", "ftsem"})
 """Methods that differ only in how they join the observed skeleton."""
 LONGEST_WAY_M = 5.0
@@ -47,7 +48,7 @@ class MethodConfig:
     Method `canopy` uses `canopy` and `likelihood`, the others everything else.
     """
 
-    name: MethodName = "paper"
+    name: MethodName = DEFAULT_METHOD
     cluster: ClusterConfig = field(default_factory=ClusterConfig)
     spline: SplineConfig = field(default_factory=SplineConfig)
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
@@ -87,10 +88,11 @@ class Extraction:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class _Known:
-    """What is kept of a view."""
+    """What is kept of a view. shown: how many pieces of wood it shows."""
 
     camera_in_base: FloatArray
     splines: list[BranchSpline]
+    shown: int
     instances: int
     rejected: list[RejectedInstance]
 
@@ -153,7 +155,7 @@ class Skeletonizer:
             UsageError: the map would not fit into memory; nothing has changed.
         """
         if view.index in self._known:
-            return len(self._known[view.index].splines)
+            return self._known[view.index].shown
         self._check_place(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
@@ -168,6 +170,7 @@ class Skeletonizer:
         self._known[view.index] = _Known(
             camera_in_base=view.base_from_camera[:3, 3],
             splines=splines,
+            shown=len(splines),
             instances=len(masks),
             rejected=rejected,
         )
@@ -183,6 +186,7 @@ class Skeletonizer:
         self._known[view.index] = _Known(
             camera_in_base=view.base_from_camera[:3, 3],
             splines=seen.splines,
+            shown=len(seen.splines) + seen.fragments,
             instances=len(masks),
             rejected=[
                 RejectedInstance(
@@ -193,7 +197,7 @@ class Skeletonizer:
                 for instance in seen.dropped
             ],
         )
-        return len(seen.splines)
+        return self._known[view.index].shown
 
     def remove_view(self, index: int) -> None:
         """Take a view off again, as if it had never been in.

@@ -18,14 +18,14 @@ class SplineConfig:
     control_points: the paper's four; each needs points that weigh at least `min_weight`.
     centre_shift: by how many radii the visible surface is moved away from the camera, pi/4 being
     the mean depth of a cylinder's front.
-    radius: "extent" is the paper's half extent along PC2; "across" looks across the ray only,
-    where depth noise cannot enter.
+    radius: "extent" is the paper's half extent along PC2; "outline" is half the mask's width, where
+    neither depth noise nor holes in depth can enter.
     """
 
     control_points: int = 4
     min_weight: float = 2.0
     centre_shift: float = np.pi / 4
-    radius: Literal["extent", "across"] = "across"
+    radius: Literal["extent", "outline"] = "outline"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -57,11 +57,12 @@ def fit_splines(clusters: Sequence[BranchCluster], config: SplineConfig) -> list
     )
     cameras = np.array([cluster.camera_in_base for cluster in clusters])
     rays = directions_across(means - cameras, axes[:, 0])
-    widths = np.zeros((len(clusters), 2))
-    fit.half_widths(points, start, controls, axes, counts, rays, widths)
-    across_m = widths[:, 1] + [cluster.margin_m for cluster in clusters]
-    radius_m = widths[:, 0] if config.radius == "extent" else across_m
-    controls += (config.centre_shift * across_m[:, None] * rays)[:, None]
+    outline_m = np.array([cluster.half_width_m for cluster in clusters])
+    radius_m = outline_m
+    if config.radius == "extent":
+        radius_m = np.zeros(len(clusters))
+        fit.half_extents(points, start, axes, radius_m)
+    controls += (config.centre_shift * outline_m[:, None] * rays)[:, None]
     return [
         BranchSpline(
             view_index=cluster.view_index,

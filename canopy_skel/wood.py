@@ -24,7 +24,7 @@ class FragmentConfig:
 
     min_probability: float = 0.6
     blur_px: int = 3
-    min_px: int = 8
+    min_px: int = 14
     max_px: int = 4000
     margin_m: float = 0.3
     shrink_px: float = 2.0

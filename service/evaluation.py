@@ -150,7 +150,7 @@ def skeletons(
     result: dict[str, dict[str, float | None]] = {}
     for name, own in (("recorded", None), (segmenter, weights)):
         request = ReplayRequest(
-            config=MethodConfig(),
+            config=MethodConfig(name="paper"),
             segmenter=name,
             weights=own,
             formats=("json",),

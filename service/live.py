@@ -8,7 +8,7 @@ import numpy as np
 from canopy_skel.document import RejectedView, to_json
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.frame import Intrinsics, View
-from canopy_skel.pipeline import MethodConfig, Skeletonizer
+from canopy_skel.pipeline import MethodConfig, MethodName, Skeletonizer
 from canopy_skel.recording import view_from_messages
 from drivers.stereo import with_depth
 from service.doctor import available_memory_bytes
@@ -109,8 +109,9 @@ def warm_up(stage: Stage) -> None:
         instances=instances,
         scores=(0.9, 0.9),
     )
-    skeletonizer = Skeletonizer(SEGMENTERS["recorded"](), MethodConfig(), stage=stage)
-    skeletonizer.add_view(view)
-    skeletonizer.preview()
-    extraction = skeletonizer.skeleton()
-    to_json(document_of(skeletonizer, extraction, scan_id="warm-up", rejected=()))
+    names: tuple[MethodName, ...] = ("paper", "canopy")
+    for name in names:
+        maker = Skeletonizer(SEGMENTERS["recorded"](), MethodConfig(name=name), stage=stage)
+        maker.add_view(view)
+        maker.preview()
+        to_json(document_of(maker, maker.skeleton(), scan_id="warm-up", rejected=()))

@@ -41,13 +41,9 @@ def diagonalise(matrix: Floats, vectors: Floats) -> None:
                     vectors[i, p], vectors[i, q] = c * a - s * b, s * a + c * b
 
 
-@njit("void(float64[:,::1], int64, int64, float64[:,::1], float64[::1])", cache=True, nogil=True)
-def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Floats) -> None:
-    """Write the principal axes of points [first, end) as rows, longest first, and their mean.
-
-    The sign of an axis is canonical: its largest component is positive.
-    """
-    spread, vectors = np.zeros((3, 3)), np.empty((3, 3))
+@njit("void(float64[:,::1], int64, int64, float64[::1], float64[:,::1])", cache=True, nogil=True)
+def scatter_of(points: Floats, first: int, end: int, mean: Floats, spread: Floats) -> None:
+    """Write the mean of points [first, end) and the matrix (3, 3) of their squared deviations."""
     mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
     for n in range(first, end):
         mx, my, mz = mx + points[n, 0], my + points[n, 1], mz + points[n, 2]
@@ -61,6 +57,16 @@ def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Fl
     spread[0, 1] = spread[1, 0] = xy
     spread[0, 2] = spread[2, 0] = xz
     spread[1, 2] = spread[2, 1] = yz
+
+
+@njit("void(float64[:,::1], int64, int64, float64[:,::1], float64[::1])", cache=True, nogil=True)
+def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Floats) -> None:
+    """Write the principal axes of points [first, end) as rows, longest first, and their mean.
+
+    The sign of an axis is canonical: its largest component is positive.
+    """
+    spread, vectors = np.empty((3, 3)), np.empty((3, 3))
+    scatter_of(points, first, end, mean, spread)
     diagonalise(spread, vectors)
     used = np.zeros(3)
     for row in range(3):
@@ -182,47 +188,14 @@ def fit_splines(
         counts[c] = count
 
 
-@njit(
-    "void(float64[:,::1], int64[::1], float64[:,:,::1], float64[:,:,::1], int64[::1],"
-    " float64[:,::1], float64[:,::1])",
-    cache=True,
-    nogil=True,
-)
-def half_widths(
-    points: Floats,
-    start: Ints,
-    controls: Floats,
-    axes: Floats,
-    counts: Ints,
-    rays: Floats,
-    widths: Floats,
-) -> None:
-    """Write half the extent along PC2, and sqrt(3) deviations from the spline across the rays."""
+@njit("void(float64[:,::1], int64[::1], float64[:,:,::1], float64[::1])", cache=True, nogil=True)
+def half_extents(points: Floats, start: Ints, axes: Floats, extents: Floats) -> None:
+    """Write half the extent of every cluster along PC2."""
     for c in range(len(start) - 1):
-        first, end, count = start[c], start[c + 1], counts[c]
-        ax, ay, az = axes[c, 0, 0], axes[c, 0, 1], axes[c, 0, 2]
-        bx, by, bz = axes[c, 1, 0], axes[c, 1, 1], axes[c, 1, 2]
-        sx = rays[c, 1] * az - rays[c, 2] * ay
-        sy = rays[c, 2] * ax - rays[c, 0] * az
-        sz = rays[c, 0] * ay - rays[c, 1] * ax
-        near, far, low, high = math.inf, -math.inf, math.inf, -math.inf
-        for n in range(first, end):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            t, u = x * ax + y * ay + z * az, x * bx + y * by + z * bz
-            near, far, low, high = min(near, t), max(far, t), min(low, u), max(high, u)
-        scale = (count - 1) / max(far - near, 1e-12)
-        total = squares = 0.0
-        for n in range(first, end):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            place = (x * ax + y * ay + z * az - near) * scale
-            k = min(int(place), count - 2)
-            b = place - k
-            a = 1.0 - b
-            off = sx * (x - a * controls[c, k, 0] - b * controls[c, k + 1, 0])
-            off += sy * (y - a * controls[c, k, 1] - b * controls[c, k + 1, 1])
-            off += sz * (z - a * controls[c, k, 2] - b * controls[c, k + 1, 2])
-            total += off
-            squares += off * off
-        mean = total / (end - first)
-        variance = max(squares / (end - first) - mean * mean, 0.0)
-        widths[c, 0], widths[c, 1] = (high - low) / 2.0, math.sqrt(3.0 * variance)
+        low, high = math.inf, -math.inf
+        for n in range(start[c], start[c + 1]):
+            across = 0.0
+            for j in range(3):
+                across += points[n, j] * axes[c, 1, j]
+            low, high = min(low, across), max(high, across)
+        extents[c] = (high - low) / 2.0

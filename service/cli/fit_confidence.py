@@ -24,6 +24,7 @@ def fit_confidence(
     # Imported here: only this command fits.
     from canopy_skel.confidence import models_to
     from canopy_skel.fitting import fit_models, reliability
+    from canopy_skel.pipeline import MethodConfig
     from service.lessons import lesson_from
 
     if output.is_dir():
@@ -35,7 +36,11 @@ def fit_confidence(
             lessons.append(lesson_from(path, segmenter))
             progress.advance(task)
     names = ", ".join(sorted(path.stem for path in recordings))
-    models = fit_models(lessons, f"fitted to {len(lessons)} scans: {names}")
+    settings = MethodConfig(name="canopy").sha256()[:12]
+    models = fit_models(
+        lessons,
+        f"fitted to {len(lessons)} scans ({segmenter} masks, settings {settings}): {names}",
+    )
     output.write_bytes(models_to(models))
     stderr.print(f"{output}: {models.provenance}", markup=False)
     for path in held_out or []:

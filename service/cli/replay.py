@@ -8,17 +8,17 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from canopy_skel.canopy import CanopyConfig
+from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.exports import FORMATS
-from canopy_skel.likelihood import LikelihoodConfig
-from canopy_skel.pipeline import METHODS, MethodConfig
+from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
 from service.cli.shell import AsJson, Exit, Out, complain, progress_bars, stderr, topic_options
 from service.doctor import available_memory_bytes
 from service.outputs import require_writable
 from service.replay import ReplayRequest, ReplayResult
 from service.replay import replay as replay_recording
 from service.segmenters import NAMES
+from service.specs import method_config
 
 MOST_MAP_MEMORY = 3 << 30
 
@@ -26,7 +26,7 @@ MOST_MAP_MEMORY = 3 << 30
 def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = DEFAULT_METHOD,
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")] = "recorded",
     weights: Annotated[Path | None, typer.Option(help="Weights of the segmenter (.pt).")] = None,
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
@@ -38,6 +38,9 @@ def replay(
     fragments: Annotated[
         bool, typer.Option(help="Use small wood outside the masks (method canopy).")
     ] = True,
+    farthest: Annotated[
+        float, typer.Option(help="Wood farther from the camera (m) is another tree's.", min=0.31)
+    ] = FARTHEST_M,
     rooted: Annotated[
         bool,
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
@@ -46,10 +49,12 @@ def replay(
 ) -> None:
     """Turn recordings into skeletons, with an overlay picture and a summary for each."""
     request = ReplayRequest(
-        config=MethodConfig(
-            name=method,  # type: ignore[arg-type]  # MethodConfig names the known ones
-            likelihood=LikelihoodConfig(voxel_size_m=voxel),
-            canopy=CanopyConfig(use_fragments=fragments, rooted=rooted),
+        config=method_config(
+            method,  # type: ignore[arg-type]  # MethodConfig names the known ones
+            voxel,
+            farthest_m=farthest,
+            rooted=rooted,
+            fragments=fragments,
         ),
         segmenter=segmenter,
         weights=weights,

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from canopy_skel.pipeline import METHODS
+from canopy_skel.cluster import FARTHEST_M
+from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
 from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
 from service.outputs import require_writable, write_all
 from service.skeletons import SEGMENTERS
@@ -15,9 +16,16 @@ def scan(
     output: Out,
     tree: Annotated[str, typer.Option(help="Which tree this is.")] = "tree",
     path: Annotated[str, typer.Option(help="Named path of waypoints.")] = "orchard-10",
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "paper",
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = DEFAULT_METHOD,
     segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(SEGMENTERS)}.")] = "recorded",
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
+    farthest: Annotated[
+        float, typer.Option(help="Wood farther from the camera (m) is another tree's.")
+    ] = FARTHEST_M,
+    rooted: Annotated[
+        bool,
+        typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
+    ] = False,
     url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
     as_json: AsJson = False,
 ) -> None:
@@ -36,8 +44,15 @@ def scan(
             if event.kind in ("retake", "stopped", "failed"):
                 stderr.print(f"{event.kind}: {status.detail or dict(event.fields)}", markup=False)
 
-        body = {"tree_id": tree, "path": path, "method": method, "voxel_size_m": voxel}
-        body["segmenter"] = segmenter
+        body = {
+            "tree_id": tree,
+            "path": path,
+            "method": method,
+            "voxel_size_m": voxel,
+            "segmenter": segmenter,
+            "farthest_m": farthest,
+            "rooted": rooted,
+        }
         result = run_scan(url, body, show)
     status = result.status
     contents = {f"{status.scan_id}.mcap": fetch(url, f"/v1/scans/{status.scan_id}/recording.mcap")}

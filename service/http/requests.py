@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.geometry import FloatArray, rotation_from_quaternion, transform_from
-from canopy_skel.pipeline import MethodConfig, MethodName
+from canopy_skel.pipeline import DEFAULT_METHOD, MethodConfig, MethodName
 from service.rig import PlanRefusedError, ScanSpec
 from service.specs import method_config
 
@@ -82,13 +83,34 @@ class ScanBody(PlanBody):
     """What to scan and how."""
 
     tree_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-    method: MethodName = "paper"
+    method: MethodName = DEFAULT_METHOD
     voxel_size_m: Annotated[float, Field(ge=0.001, le=0.05, allow_inf_nan=False)] = 0.005
     segmenter: Annotated[
         Literal["recorded", "unet"],
         Field(description="where branch masks come from: the recording, or the learned segmenter"),
     ] = "recorded"
+    farthest_m: Annotated[
+        float,
+        Field(
+            gt=0.3,
+            le=20.0,
+            allow_inf_nan=False,
+            description="wood farther from the camera is another tree's",
+        ),
+    ] = FARTHEST_M
+    rooted: Annotated[
+        bool,
+        Field(description="join everything into one tree, however unsure; method canopy only"),
+    ] = False
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
+
+    @model_validator(mode="after")
+    def _can_be_rooted(self) -> Self:
+        if self.rooted and self.method != "canopy":
+            raise ValueError(
+                f"method {self.method} cannot be rooted; choose canopy or leave it out"
+            )
+        return self
 
 
 class AcknowledgeBody(Body):
@@ -129,7 +151,9 @@ def scan_spec(
     return replace(
         plan_spec(body, paths, caps),
         tree_id=body.tree_id,
-        config=method_config(body.method, body.voxel_size_m),
+        config=method_config(
+            body.method, body.voxel_size_m, farthest_m=body.farthest_m, rooted=body.rooted
+        ),
         segmenter=body.segmenter,
         retakes=body.retakes,
     )

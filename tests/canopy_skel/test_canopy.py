@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scenes.leaves import GAP, leafy_view
 from scenes.wood import WOOD, view_from
 
-from canopy_skel.canopy import CanopyConfig, canopy_config_from
+from canopy_skel.canopy import CanopyConfig, CanopyScan, canopy_config_from
 from canopy_skel.confidence import (
     Logistic,
     fit_logistic,
@@ -22,7 +22,9 @@ from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.ends import find_ends
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
+from canopy_skel.geometry import transform_points
 from canopy_skel.links import Candidates, accepted
+from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer
 from canopy_skel.segmenters.recorded import RecordedSegmenter
@@ -92,6 +94,22 @@ def test_radii_are_those_of_the_sticks(views):
     assert np.median(document.radius[trunk]) == pytest.approx(0.015, rel=0.15)
 
 
+def test_wood_lies_along_wood_in_view_after_view_and_beside_it_crosswise():
+    scan = CanopyScan(CanopyConfig())
+    segmenter = RecordedSegmenter()
+    one, other = (scan.observe(v, segmenter.segment(v)) for v in (PLAIN, view_from(1, y=0.1)))
+    points, way = one.points_in_base, one.directions
+    seen = other.agreement(points, way)
+    assert seen[:, 0].mean() > 0.95
+    np.testing.assert_array_equal(seen[:, 1], seen[:, 0])
+    assert not seen[:, 2].any()
+    across = np.linalg.svd(way[:, None, :])[2][:, 2]
+    turned = other.agreement(points, across)
+    assert turned[:, 0].mean() > 0.95
+    assert turned[:, 1].mean() < 0.2
+    assert not other.agreement(points + 0.5, way).any()
+
+
 def test_the_order_of_views_and_asking_in_between_do_not_matter_to_the_byte(views):
     expected = to_json(document_of(maker_of(views)))
     for order in permutations(views):
@@ -148,7 +166,8 @@ def test_views_without_wood_give_an_empty_skeleton():
 
 
 def test_other_methods_do_not_notice_the_settings_of_canopy():
-    assert MethodConfig(canopy=CanopyConfig(rooted=True)).sha256() == MethodConfig().sha256()
+    paper = MethodConfig(name="paper")
+    assert replace(paper, canopy=CanopyConfig(rooted=True)).sha256() == paper.sha256()
     rooted = MethodConfig(name="canopy", canopy=CanopyConfig(rooted=True))
     assert rooted.sha256() != MethodConfig(name="canopy").sha256()
 
@@ -169,6 +188,40 @@ def test_pieces_run_along_the_axes_of_the_sticks():
         length = np.linalg.norm(knots[-1] - knots[0])
         assert length == pytest.approx(np.linalg.norm(np.subtract(end, start)), abs=0.012)
         assert piece.spline.radius_m == pytest.approx(radius, rel=0.25)
+
+
+def test_a_wall_is_no_branch():
+    wall = np.zeros((240, 320), np.uint16)
+    wall[60:180, 20:300] = 1
+    view = replace(
+        PLAIN, instances=wall, scores=(0.9,), depth_m=np.ones((240, 320), dtype=np.float32)
+    )
+    regions = regions_of_masks(RecordedSegmenter().segment(view))
+    assert pieces_of(view, regions, PieceConfig(), fragments=False) == []
+    thicker = PieceConfig(thickest_m=0.5)
+    assert len(pieces_of(view, regions, thicker, fragments=False)) == 1
+
+
+def test_wood_of_the_next_row_is_not_of_this_tree():
+    behind = PLAIN.instances == 3
+    view = replace(PLAIN, depth_m=np.where(behind, np.float32(4.2), PLAIN.depth_m))
+    masks = RecordedSegmenter().segment(view)
+    seen = observe(view, list(masks), PieceConfig(), FragmentConfig())
+    assert (len(seen.splines), seen.dropped) == (2, (3,))
+    assert off_wood(seen.points_in_base).max() < 0.03
+    there = transform_points(
+        view.base_from_camera, back_projected(view, behind & np.isfinite(view.depth_m))
+    )
+    assert not np.any(seen.evidence.classify(there) == WOOD_SEEN)
+    wider = observe(view, list(masks), PieceConfig(farthest_m=5.0), FragmentConfig())
+    assert len(wider.splines) == 3
+
+
+def back_projected(view, chosen):
+    v, u = np.nonzero(chosen)
+    return view.intrinsics.back_project(
+        u.astype(np.float64), v.astype(np.float64), view.depth_m[v, u].astype(np.float64)
+    )
 
 
 def test_leaves_that_cover_some_pixels_do_not_move_a_piece():
@@ -234,6 +287,8 @@ def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():
     maker = Skeletonizer(Detector(), MethodConfig(name="canopy"))
     assert isinstance(Detector(), WoodDetector)
     assert maker.add_view(replace(PLAIN, instances=masks)) == 3
+    without = maker_of([replace(PLAIN, instances=masks)], use_fragments=False)
+    assert maker.skeleton().voxels == without.skeleton().voxels
 
 
 @settings(deadline=None, max_examples=30)

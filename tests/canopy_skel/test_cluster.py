@@ -1,17 +1,14 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import naive_cluster
 
-from canopy_skel.cluster import (
-    ClusterConfig,
-    cluster_branches,
-    connected_parts,
-    eroded,
-    principal_axes,
-)
+from canopy_skel.cluster import ClusterConfig, cluster_branches, principal_axes
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Intrinsics, View
+from canopy_skel.kernels.strip import measure
+from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
 LENS = Intrinsics(fx_px=400, fy_px=400, cx_px=160, cy_px=100, width_px=320, height_px=200)
@@ -53,7 +50,68 @@ def test_a_branch_becomes_its_visible_points():
     assert len(cluster.points_in_base) == 6 * 198
     np.testing.assert_allclose(cluster.points_in_base[:, 2], 1.0, atol=1e-6)
     np.testing.assert_allclose(np.ptp(cluster.points_in_base[:, 0]), 197 / 400, atol=1e-6)
-    assert cluster.margin_m == pytest.approx(1 / 400)
+    tangent = 4 / 400
+    assert cluster.half_width_m == pytest.approx(tangent / (1 - np.pi / 4 * tangent), rel=0.02)
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, 75, 90, 140])
+@pytest.mark.parametrize("radius_px", [2.0, 5.0, 20.0])
+def test_the_outline_tells_the_radius_whatever_the_slope(angle_deg, radius_px):
+    masks = strip(angle_deg, radius_px)
+    assert width_px(masks) == pytest.approx(2 * radius_px, rel=0.12)
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, 75, 90, 140])
+def test_leaves_over_a_third_of_the_edge_do_not_make_wood_thin(angle_deg):
+    whole = strip(angle_deg, 8.0)
+    bitten = whole.copy()
+    along, across = axes_of(angle_deg)
+    bitten[(across > -2) & (np.abs(along) < 30)] = False
+    assert width_px(bitten) == pytest.approx(16.0, rel=0.08)
+
+
+def test_wood_at_the_edge_of_the_picture_is_no_thicker():
+    """The picture stretches what lies far off its axis; the ray sees the wood's own width."""
+    radius_m, wide = (
+        0.02,
+        Intrinsics(fx_px=400, fy_px=400, cx_px=160, cy_px=100, width_px=800, height_px=200),
+    )
+    foot = np.array([1.2, 0.0, 1.0])
+    v, u = np.indices((200, 800))
+    rays = wide.back_project(u.ravel(), v.ravel(), np.ones(u.size))
+    normal = np.cross(rays, [0.0, 1.0, 0.0])
+    apart = np.abs(normal @ foot) / np.linalg.norm(normal, axis=1)
+    wood = (apart < radius_m).reshape(200, 800)
+    view = View(
+        index=0,
+        stamp_ns=1,
+        color_rgb=np.zeros((200, 800, 3), np.uint8),
+        intrinsics=wide,
+        base_from_camera=np.eye(4),
+        depth_m=np.where(wood, 1.0 - np.pi / 4 * radius_m, np.nan).astype(np.float32),
+        instances=wood.astype(np.uint16),
+        scores=(0.9,),
+    )
+    (cluster,), _ = cluster_branches(view, RecordedSegmenter().segment(view), CONFIG)
+    assert cluster.half_width_m == pytest.approx(radius_m, rel=0.04)
+
+
+def axes_of(angle_deg):
+    """Return how far along and across a line through the middle each pixel lies."""
+    v, u = np.indices((200, 320)) - np.array([100.3, 160.4])[:, None, None]
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return u * cosine + v * sine, v * cosine - u * sine
+
+
+def strip(angle_deg, radius_px):
+    along, across = axes_of(angle_deg)
+    return (np.abs(across) < radius_px) & (np.abs(along) < 90)
+
+
+def width_px(mask):
+    found = np.empty(5)
+    measure(mask, found)
+    return 2 * found[0]
 
 
 def test_leaves_in_front_and_background_behind_are_cut_from_a_tilted_branch():
@@ -111,24 +169,63 @@ def test_a_view_without_depth_says_what_to_do():
 
 
 def test_a_thin_mask_is_not_eroded_away():
-    thin = np.zeros((5, 40), bool)
-    thin[2] = True
-    np.testing.assert_array_equal(eroded(thin, 1, 0.3), thin)
-    thick = np.ones((12, 40), bool)
-    assert eroded(thick, 1, 0.3).sum() == 10 * 38
+    depth_m, instances = stick()
+    instances[:] = 0
+    instances[99:101, 60:260] = 1
+    (cluster,), _ = clusters_of(depth_m, instances)
+    assert len(cluster.points_in_base) == 2 * 200
+
+
+def test_a_mask_outside_the_picture_is_refused():
+    view = view_with(*stick())
+    masks = [
+        BranchMask(instance=7, left_px=300, top_px=5, mask=np.ones((4, 30), bool), confidence=0.5)
+    ]
+    with pytest.raises(ViewError, match=r"instance 7 covers columns 300 to 330"):
+        cluster_branches(view, masks, CONFIG)
+
+
+def test_no_masks_give_no_clusters():
+    assert clusters_of(stick()[0], np.zeros((200, 320)), scores=()) == ([], [])
+
+
+def cluttered(seed):
+    """A few branches, bent and across one another, with noise, leaves, holes and a blob."""
+    random = np.random.default_rng(seed)
+    depth_m, instances = np.full((200, 320), 2.5), np.zeros((200, 320))
+    rows, columns = np.mgrid[:200, :320]
+    count = int(random.integers(1, 7))
+    for number in range(1, count + 1):
+        middle, angle = random.uniform((40, 40), (160, 280)), random.uniform(0, np.pi)
+        along = (columns - middle[1]) * np.cos(angle) + (rows - middle[0]) * np.sin(angle)
+        across = (rows - middle[0]) * np.cos(angle) - (columns - middle[1]) * np.sin(angle)
+        half = random.uniform((1, 8), (9, 120))
+        inside = (np.abs(across) < half[0]) & (np.abs(along) < half[1])
+        instances[inside] = number
+        slope, at_m = random.uniform(-2e-3, 2e-3), random.uniform(0.5, 1.6)
+        depth_m[inside] = (at_m + slope * along + random.normal(0, 0.002, along.shape))[inside]
+    for _ in range(int(random.integers(0, 20))):
+        v, u = random.integers(0, 180), random.integers(0, 290)
+        leaf = random.choice([np.nan, random.uniform(0.2, 6.0)])
+        depth_m[v : v + random.integers(3, 20), u : u + random.integers(3, 30)] = leaf
+    return depth_m, instances, tuple(random.uniform(0.3, 1.0, count))
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_parts_partition_the_points_and_lie_apart(seed):
-    random = np.random.default_rng(seed)
-    points = random.uniform(0, 0.3, (random.integers(1, 60), 3))
-    parts = connected_parts(points, 0.03)
-    assert sorted(np.concatenate(parts).tolist()) == list(range(len(points)))
-    assert [len(p) for p in parts] == sorted((len(p) for p in parts), reverse=True)
-    for i, one in enumerate(parts):
-        for other in parts[i + 1 :]:
-            gaps = np.linalg.norm(points[one][:, None] - points[other][None], axis=2)
-            assert gaps.min() > 0.03 * 0.999
+@settings(max_examples=60)
+def test_all_masks_at_once_are_one_mask_after_the_other(seed):
+    depth_m, instances, scores = cluttered(seed)
+    view = view_with(depth_m, instances, scores)
+    masks = RecordedSegmenter().segment(view)
+    clusters, rejected = cluster_branches(view, masks, CONFIG)
+    for mask in masks:
+        expected, reasons = naive_cluster.clusters_of_mask(view, mask, CONFIG)
+        mine = [c for c in clusters if c.instance == mask.instance]
+        assert [len(c.points_in_base) for c in mine] == [len(points) for points, _ in expected]
+        for cluster, (points, width_m) in zip(mine, expected, strict=True):
+            np.testing.assert_allclose(cluster.points_in_base, points, rtol=1e-12)
+            assert cluster.half_width_m == pytest.approx(width_m, rel=1e-12)
+        assert [r.reason for r in rejected if r.instance == mask.instance] == reasons
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -135,6 +137,16 @@ def test_a_piece_outside_the_map_stays_alone():
 def test_an_empty_map_joins_nothing():
     _, joins, _ = search({}, [[(0, 0, 0)], [(9, 0, 0)]])
     assert joins == []
+
+
+def test_a_path_tapers_from_end_to_end():
+    graph = replace(graph_from([[(0, 0, 0)], [(9, 0, 0)]]), radius_m=np.array([0.02, 0.002]))
+    likelihood = map_from({(x, 0, 0): 50_000 for x in range(10)})
+    found = PathSearch(likelihood)
+    found.update(graph)
+    joined = add_paths(graph, found.joins(), likelihood)
+    order = np.argsort(joined.vertices_in_base[:, 0])
+    np.testing.assert_allclose(joined.radius_m[order], np.linspace(0.02, 0.002, 10))
 
 
 def test_straightening_moves_predicted_vertices_only():

@@ -14,6 +14,7 @@ from scenes.wood import WOOD, view_from
 from canopy_skel.confidence import models_from
 from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.graph import SkeletonGraph
+from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
@@ -48,7 +49,10 @@ def test_fit_confidence_writes_models_that_know_where_they_come_from(canopy, tmp
     code, stdout, _ = canopy("fit-confidence", path, "-o", models, "--held-out", path)
     assert code == 0
     assert stdout.startswith("leafy: instance_point 0.")
-    assert models_from(json.loads(models.read_bytes())).provenance == "fitted to 1 scans: leafy"
+    settings = MethodConfig(name="canopy").sha256()[:12]
+    assert models_from(json.loads(models.read_bytes())).provenance == (
+        f"fitted to 1 scans (recorded masks, settings {settings}): leafy"
+    )
 
 
 def sticks():
@@ -84,6 +88,14 @@ def test_replay_writes_skeleton_picture_and_summary(canopy, recording, tmp_path)
     assert set(summary["seconds"]) >= {"read", "cluster", "spline", "likelihood", "initial", "join"}
 
 
+@pytest.mark.parametrize("method", ["canopy", "paper"])
+def test_wood_farther_than_asked_for_is_left_out(canopy, recording, tmp_path, method):
+    code, _, stderr = canopy(
+        "replay", recording, "-o", tmp_path, "--method", method, "--farthest", "0.5"
+    )
+    assert (code, "no branch was found in 9 instances" in stderr) == (0, True)
+
+
 def test_canopy_says_of_every_vertex_how_it_is_known(canopy, recording, tmp_path):
     assert canopy("replay", recording, "-o", tmp_path, "--method", "canopy", "--rooted")[0] == 0
     document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())
@@ -112,11 +124,15 @@ def test_json_on_stdout_is_all_there_is_on_stdout(canopy, recording, tmp_path):
 
 
 def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
-    for method in ("canopy", "paper", "mst", "ftsem"):
-        code, _, _ = canopy("replay", recording, "-o", tmp_path / method, "--method", method)
-        assert code == 0
-        document = from_json((tmp_path / method / "sticks.skeleton.json").read_bytes())
-        assert document.method.name == method
+    def made(name, *arguments):
+        assert canopy("replay", recording, "-o", tmp_path / name, *arguments)[0] == 0
+        data = (tmp_path / name / "sticks.skeleton.json").read_bytes()
+        return from_json(data).method.name, data
+
+    methods = ("canopy", "paper", "mst", "ftsem")
+    results = {name: made(name, "--method", name) for name in methods}
+    assert tuple(name for name, _ in results.values()) == methods
+    assert made("default") == results["canopy"]
 
 
 @pytest.mark.parametrize(

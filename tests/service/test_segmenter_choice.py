@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from canopy_skel.pipeline import MethodConfig
 from service.http.requests import ScanBody, SpeedCaps, scan_spec
 from service.skeletons import SEGMENTERS
 from service.specs import fields_of, spec_from
@@ -16,6 +17,36 @@ def test_a_scan_may_ask_for_any_segmenter_and_gets_it_after_a_restart():
         spec = scan_spec(body, PATHS, SpeedCaps())
         assert spec.segmenter == name
         assert spec_from(spec.scan_id, fields_of(spec)).segmenter == name
+
+
+def test_a_scan_is_made_with_method_canopy_unless_it_says_otherwise():
+    spec = scan_spec(ScanBody(tree_id="t", path="one"), PATHS, SpeedCaps())
+    assert spec.config == MethodConfig(name="canopy")
+    assert spec_from(spec.scan_id, fields_of(spec)).config == spec.config
+
+
+def test_a_scan_may_ask_for_one_rooted_tree_and_gets_it_after_a_restart():
+    spec = scan_spec(ScanBody(tree_id="t", path="one", rooted=True), PATHS, SpeedCaps())
+    assert spec.config.canopy.rooted
+    assert spec_from(spec.scan_id, fields_of(spec)).config == spec.config
+
+
+def test_a_scan_may_say_how_far_its_tree_reaches_for_every_method():
+    spec = scan_spec(ScanBody(tree_id="t", path="one", farthest_m=2.5), PATHS, SpeedCaps())
+    assert spec.config.cluster.farthest_m == spec.config.canopy.pieces.farthest_m == 2.5
+    assert spec_from(spec.scan_id, fields_of(spec)).config == spec.config
+
+
+def test_requests_kept_before_trees_could_be_rooted_are_still_understood():
+    spec = scan_spec(ScanBody(tree_id="t", path="one"), PATHS, SpeedCaps())
+    fields = fields_of(spec)
+    del fields["rooted"], fields["farthest_m"]
+    assert spec_from(spec.scan_id, fields).config == spec.config
+
+
+def test_methods_that_cannot_root_refuse_to():
+    with pytest.raises(ValidationError, match="method paper cannot be rooted; choose canopy"):
+        ScanBody(tree_id="t", path="one", method="paper", rooted=True)
 
 
 def test_an_unknown_segmenter_is_refused_before_anything_moves():

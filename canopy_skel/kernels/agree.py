@@ -1,0 +1,59 @@
+"""Which points of one view lie along points of another."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from canopy_skel.kernels.fuse import Floats, Ints, cell_key
+
+AGREEMENT = 3
+"""Columns: beside any point of the other view, along an instance's, along a fragment's."""
+
+
+@njit(cache=True, nogil=True)
+def agreement(
+    points: Floats,
+    directions: Floats,
+    references: Floats,
+    reference_directions: Floats,
+    fragment: NDArray[np.bool_],
+    keys: Ints,
+    cell_m: float,
+    across_m: float,
+    reach_m: float,
+    min_cosine: float,
+) -> Ints:
+    """Say of points (P, 3) what points of another view (R, 3) they have near by, (P, AGREEMENT).
+
+    References lie sorted by the `keys` of their cells of `cell_m`. Near is within `reach_m` and
+    within `across_m` across the point's own direction; along is near and with |cos| of the angle
+    between the directions of at least `min_cosine`.
+    """
+    found = np.zeros((len(points), AGREEMENT), dtype=np.int64)
+    for i in range(len(points)):
+        px, py, pz = points[i]
+        dx, dy, dz = directions[i]
+        for x in range(
+            math.floor((px - reach_m) / cell_m), math.floor((px + reach_m) / cell_m) + 1
+        ):
+            for y in range(
+                math.floor((py - reach_m) / cell_m), math.floor((py + reach_m) / cell_m) + 1
+            ):
+                low = cell_key(x, y, math.floor((pz - reach_m) / cell_m))
+                high = cell_key(x, y, math.floor((pz + reach_m) / cell_m))
+                j = np.searchsorted(keys, low)
+                while j < len(keys) and keys[j] <= high:
+                    wx = references[j, 0] - px
+                    wy = references[j, 1] - py
+                    wz = references[j, 2] - pz
+                    squared = wx * wx + wy * wy + wz * wz
+                    along = wx * dx + wy * dy + wz * dz
+                    if squared <= reach_m**2 and squared - along * along <= across_m**2:
+                        found[i, 0] = 1
+                        rx, ry, rz = reference_directions[j]
+                        if abs(dx * rx + dy * ry + dz * rz) >= min_cosine:
+                            found[i, 2 if fragment[j] else 1] = 1
+                    j += 1
+    return found
