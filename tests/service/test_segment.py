@@ -130,7 +130,7 @@ def test_a_recording_gets_a_copy_with_instances(canopy, recording, tmp_path, wei
 def test_a_recording_judges_instances_and_the_skeleton_they_lead_to(
     canopy, recording, tmp_path, weights
 ):
-    canopy("replay", recording, "-o", tmp_path, "--formats", "json")
+    canopy("replay", recording, "-o", tmp_path, "--formats", "json", "--method", "paper")
     truth = (tmp_path / "sticks.skeleton.json").read_bytes()
     path = tmp_path / "with_truth.mcap"
     with RecordingWriter(path, {"scan_id": "s"}, tool_from_camera=np.eye(4)) as writer:
