@@ -1,6 +1,7 @@
 """The training loop: batches in, checkpoints and a log out; it may be stopped and resumed."""
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable
@@ -41,6 +42,11 @@ class Plan:
     gradient_norm: float = 5.0
     look_every: int = 250
     channels: tuple[int, ...] = CHANNELS
+
+    def fields(self) -> dict[str, Any]:
+        """Return the plan, ready for JSON: without `minutes` where there is no limit."""
+        values = asdict(self)
+        return values if math.isfinite(self.minutes) else {**values, "minutes": None}
 
 
 @dataclass(kw_only=True, slots=True)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any
             "reported": _figures(_again(model, halves.report)),
         },
         "training": {
-            "plan": asdict(run.plan),
+            "plan": run.plan.fields(),
             "steps": run.step,
             "chosen": chosen_path.name,
             "minutes": round(run.seconds / 60, 1),

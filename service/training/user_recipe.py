@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -145,5 +145,5 @@ def _finished(
         least_score=0.5 if init is None else init.least_score,
     )
     kind = "none: too few instances in scans that were not trained on"
-    training = {"plan": asdict(run.plan), "steps": run.step, "torch": torch.__version__}
+    training = {"plan": run.plan.fields(), "steps": run.step, "torch": torch.__version__}
     return model, {"validation": {"kind": kind, "reported": {}}, "training": training}

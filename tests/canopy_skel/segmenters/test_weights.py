@@ -126,5 +126,5 @@ def test_the_network_answers_at_half_size():
 def test_the_built_in_weights_are_small_and_say_where_they_come_from():
     assert BUILTIN.stat().st_size <= 8 << 20
     assert sum(value.numel() for value in load().network.parameters()) <= 3_000_000
-    facts = json.loads(BUILTIN.with_suffix(".json").read_text())
+    facts = json.loads(BUILTIN.with_suffix(".json").read_text(), parse_constant=pytest.fail)
     assert {"training", "validation", "sha256"} <= facts.keys()
