@@ -14,7 +14,7 @@ from canopy_skel.canopy import CanopyConfig
 from canopy_skel.document import Method, build_document, from_json
 from canopy_skel.fitting import truth_points
 from canopy_skel.metrics import score
-from canopy_skel.pipeline import MethodConfig, Skeletonizer
+from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
 from canopy_skel.recording import read_recording
 from drivers.stereo import with_depth
 from service.experiment.segmenters import segmenter_named
@@ -140,8 +140,8 @@ def figures_of(path, cache, names):
 
 
 def run(views, truth, segmenter, config):
-    seen = Once(segmenter_named(segmenter), views)
-    maker = Skeletonizer(seen, config)
+    inner = segmenter_named(segmenter)
+    maker = Skeletonizer(Once(inner, views), config, models=models_for(inner))
     for view in views[:-1]:
         maker.add_view(view)
     started = time.process_time()
