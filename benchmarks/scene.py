@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from canopy_skel.cluster import BranchCluster
+from canopy_skel.frame import Intrinsics, View
+from canopy_skel.segment import BranchMask
 
 BOX_M = 2.0
+WIDTH_PX, HEIGHT_PX = 1280, 800
 SECTION_M = 0.17
 OVERLAP_M = 0.02
 NOISE_M = 0.002
@@ -87,3 +90,42 @@ def cluster_of(section, view, instance, eye, random):
         camera_in_base=eye,
         points_in_base=points,
     )
+
+
+def picture_of(instances, *, seed=2):
+    """Return a view, and in it masks of straight pieces of wood of about 1000 pixels each."""
+    random = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+    depth_m = np.full((HEIGHT_PX, WIDTH_PX), 3.0)
+    masks = []
+    for number in range(1, instances + 1):
+        middle = random.uniform((150, 150), (HEIGHT_PX - 150, WIDTH_PX - 150))
+        angle = random.uniform(0, np.pi)
+        along = (columns - middle[1]) * np.cos(angle) + (rows - middle[0]) * np.sin(angle)
+        across = (rows - middle[0]) * np.cos(angle) - (columns - middle[1]) * np.sin(angle)
+        inside = (np.abs(across) < random.uniform(2, 5)) & (np.abs(along) < 70)
+        slope = random.uniform(-1e-3, 1e-3)
+        depth_m[inside] = random.uniform(0.7, 1.4) + slope * along[inside]
+        v, u = np.nonzero(inside)
+        box = inside[v.min() : v.max() + 1, u.min() : u.max() + 1]
+        masks.append(
+            BranchMask(
+                instance=number,
+                left_px=int(u.min()),
+                top_px=int(v.min()),
+                mask=box,
+                confidence=float(random.uniform(0.5, 0.99)),
+            )
+        )
+    depth_m += random.normal(0, NOISE_M, depth_m.shape)
+    view = View(
+        index=0,
+        stamp_ns=0,
+        color_rgb=np.zeros((HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8),
+        intrinsics=Intrinsics(
+            fx_px=800, fy_px=800, cx_px=640, cy_px=400, width_px=WIDTH_PX, height_px=HEIGHT_PX
+        ),
+        base_from_camera=np.eye(4),
+        depth_m=depth_m.astype(np.float32),
+    )
+    return view, masks

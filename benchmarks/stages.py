@@ -2,27 +2,28 @@
 
     python benchmarks/stages.py [--quick] [--output docs/results] [part ...]
 
-Parts: stages, updates, scaling, replay; all of them if none is named. Prints tables and, with
---output, writes them to bench.md and the scaling curves to bench-scaling.png there. Times are CPU
-time of the thread, the least of some runs or the median over views: the machine's speed cancels
-out of the ratios, other jobs nearly do.
+Parts: stages, updates, alone, scaling, replay; all of them if none is named. Prints tables and,
+with --output, writes them to bench.md and the scaling curves to bench-scaling.png there. Times are
+CPU time of the thread, the least of some runs or the median over views: the machine's speed
+cancels out of the ratios, other jobs nearly do.
 """
 
 import argparse
 import platform
 from pathlib import Path
 
-from parts import replay, scaling, stages, updates
+from parts import alone, closing, replay, scaling, stages, updates
 
 PARTS = {
     "stages": stages.report,
     "updates": updates.report,
+    "alone": alone.report,
     "scaling": scaling.report,
     "replay": replay.report,
 }
 HEAD = """# Benchmarks
 
-Made by `make bench` on {machine}: CPU time of one thread, milliseconds. The canopy is synthetic
+Made by {how} on {machine}: CPU time of one thread, milliseconds. The canopy is synthetic
 (`benchmarks/scene.py`: 66 m of wood in 2 x 2 x 2 m, 25 instances a view, 2 mm noise) and easier
 than a real one: no false detections, perfect poses.
 """
@@ -34,15 +35,20 @@ def main():
     parser.add_argument("--quick", action="store_true", help="10 and 5 mm, few views")
     parser.add_argument("--output", type=Path, help="folder for bench.md and the curves")
     options = parser.parse_args()
-    texts = [HEAD.format(machine=f"{platform.machine()}, Python {platform.python_version()}")]
-    print(texts[0])
+    machine = f"{platform.machine()}, Python {platform.python_version()}"
+    how = "`make bench`" if not options.quick else "`benchmarks/stages.py --quick`"
+    head, texts, facts = HEAD.format(machine=machine, how=how), [], {}
+    print(head)
     for name in options.parts or PARTS:
-        text = PARTS[name](options.quick, options.output)
+        text, found = PARTS[name](options.quick, options.output)
         print(text, flush=True)
         texts.append(text)
+        facts |= found
         if options.output:
             options.output.mkdir(parents=True, exist_ok=True)
-            (options.output / "bench.md").write_text("\n".join(texts))
+            page = "\n".join([head, closing.report(facts), *texts])
+            (options.output / "bench.md").write_text(page)
+    print(closing.report(facts))
 
 
 if __name__ == "__main__":

@@ -2,15 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from typing import NamedTuple
 
-import cv2
 import numpy as np
-from scipy.ndimage import label
 
 from canopy_skel.errors import ViewError
-from canopy_skel.frame import Intrinsics, View
+from canopy_skel.frame import Float32Array, Intrinsics, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
+from canopy_skel.kernels import parts, trust
 from canopy_skel.kernels.strip import measure
 from canopy_skel.segment import BranchMask
 
@@ -71,76 +70,137 @@ class RejectedInstance:
     reason: str
 
 
+class UsablePixels(NamedTuple):
+    """Pixels (N, 3) of u, v and depth; those of mask i from start[i] up to start[i + 1].
+
+    sizes: (M,) how many pixels there are with those without depth.
+    """
+
+    pixels: FloatArray
+    start: IntArray
+    sizes: IntArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Trusted:
+    """Points (N, 3), those of mask i from start[i] up to start[i + 1], and of each mask (M,).
+
+    enough: whether it has points.
+    """
+
+    points_in_camera: FloatArray
+    start: IntArray
+    enough: BoolArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Parts:
+    """Points (N, 3) part by part, and of each part (P,) its mask, flatness and median depth."""
+
+    points_in_camera: FloatArray
+    start: IntArray
+    mask: IntArray
+    flatness: FloatArray
+    depth_m: FloatArray
+
+
 def cluster_branches(
     view: View, masks: Iterable[BranchMask], config: ClusterConfig
 ) -> tuple[list[BranchCluster], list[RejectedInstance]]:
     """Lift the masks of a view into base.
 
     Raises:
-        ViewError: the view has no depth.
+        ViewError: the view has no depth, or a mask reaches out of it.
     """
-    results = [_clusters_of_mask(view, mask, config) for mask in masks]
-    clusters = list(chain.from_iterable(found for found, _ in results))
-    rejected = [
-        RejectedInstance(view_index=view.index, instance=instance, reason=reason)
-        for _, reasons in results
-        for instance, reason in reasons
-    ]
+    if view.depth_m is None:
+        raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
+    masks = list(masks)
+    for mask in masks:
+        _check_box(view, mask)
+    if not masks:
+        return [], []
+    trusted = _trusted_points(view, view.depth_m, masks, config)
+    slender = _slender_parts(trusted, config)
+    in_base = transform_points(view.base_from_camera, slender.points_in_camera)
+    clusters, rejected = [], []
+    for i, mask in enumerate(masks):
+        reasons = [] if trusted.enough[i] else ["too few points with trusted depth"]
+        strip = np.empty(5)
+        if trusted.enough[i]:
+            measure(mask.mask, strip)
+        for part in range(*np.searchsorted(slender.mask, (i, i + 1)).tolist()):
+            first, end = slender.start[part : part + 2].tolist()
+            if end - first < config.min_points:
+                reasons.append("part too small")
+            elif slender.flatness[part] > config.max_flatness:
+                reasons.append("not slender")
+            else:
+                clusters.append(
+                    BranchCluster(
+                        view_index=view.index,
+                        instance=mask.instance,
+                        confidence=mask.confidence,
+                        half_width_m=half_width_m(
+                            strip, mask, float(slender.depth_m[part]), view.intrinsics
+                        ),
+                        camera_in_base=view.base_from_camera[:3, 3],
+                        points_in_base=in_base[first:end],
+                    )
+                )
+        rejected += [
+            RejectedInstance(view_index=view.index, instance=mask.instance, reason=reason)
+            for reason in reasons
+        ]
     return clusters, rejected
 
 
-def _clusters_of_mask(
-    view: View, mask: BranchMask, config: ClusterConfig
-) -> tuple[list[BranchCluster], Sequence[tuple[int, str]]]:
-    inner = eroded(mask.mask, config.erosion_px, config.min_eroded_share)
-    in_camera = _trusted_points(view, mask, inner, config)
-    if len(in_camera) < max(config.min_points, config.min_trusted_share * inner.sum()):
-        return [], [(mask.instance, "too few points with trusted depth")]
-    strip = np.empty(5)
-    measure(mask.mask, strip)
-    clusters, reasons = [], []
-    for part in connected_parts(in_camera, config.connect_m):
-        points = in_camera[part]
-        if len(points) < config.min_points:
-            reasons.append((mask.instance, "part too small"))
-        elif flatness(points) > config.max_flatness:
-            reasons.append((mask.instance, "not slender"))
-        else:
-            clusters.append(
-                BranchCluster(
-                    view_index=view.index,
-                    instance=mask.instance,
-                    confidence=mask.confidence,
-                    half_width_m=half_width_m(strip, mask, points, view.intrinsics),
-                    camera_in_base=view.base_from_camera[:3, 3],
-                    points_in_base=transform_points(view.base_from_camera, points),
-                )
-            )
-    return clusters, reasons
+def _check_box(view: View, mask: BranchMask) -> None:
+    height, width = view.color_rgb.shape[:2]
+    right, bottom = mask.left_px + mask.mask.shape[1], mask.top_px + mask.mask.shape[0]
+    if min(mask.left_px, mask.top_px) < 0 or right > width or bottom > height:
+        raise ViewError(
+            f"view {view.index}: the mask of instance {mask.instance} covers columns"
+            f" {mask.left_px} to {right} and rows {mask.top_px} to {bottom} of a picture of"
+            f" {width}x{height}; its segmenter must cut it off at the border"
+        )
 
 
 def _trusted_points(
-    view: View, mask: BranchMask, inner: BoolArray, config: ClusterConfig
-) -> FloatArray:
-    """Return the points (N, 3) in the camera frame whose depth follows the mask's profile."""
-    if view.depth_m is None:
-        raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
-    v, u = np.nonzero(inner)
-    u, v = u + mask.left_px, v + mask.top_px
-    depth_m = view.depth_m[v, u].astype(np.float64)
-    usable = (depth_m >= config.nearest_m) & (depth_m <= config.farthest_m)
-    u, v, depth_m = u[usable], v[usable], depth_m[usable]
-    if len(depth_m) >= config.min_points:
-        pixels = np.stack([u, v], axis=1).astype(np.float64)
-        _, _, axes = np.linalg.svd(pixels - pixels.mean(axis=0), full_matrices=False)
-        follows = follows_profile((pixels - pixels.mean(axis=0)) @ axes[0], 1.0 / depth_m, config)
-        u, v, depth_m = u[follows], v[follows], depth_m[follows]
-    return view.intrinsics.back_project(u.astype(np.float64), v.astype(np.float64), depth_m)
+    view: View, depth_m: Float32Array, masks: Sequence[BranchMask], config: ClusterConfig
+) -> _Trusted:
+    """Return the points whose depth follows the profile of their mask."""
+    usable = usable_pixels(depth_m, masks, config)
+    of = np.repeat(np.arange(len(masks)), np.diff(usable.start))
+    follows = follow_profiles(usable, config)
+    count = np.bincount(of[follows], minlength=len(masks))
+    enough = count >= np.maximum(config.min_points, config.min_trusted_share * usable.sizes)
+    u, v, z = usable.pixels[follows & enough[of]].T
+    return _Trusted(
+        points_in_camera=view.intrinsics.back_project(u, v, z),
+        start=np.append(0, np.cumsum(count * enough)),
+        enough=enough,
+    )
 
 
-def half_width_m(
-    strip: FloatArray, mask: BranchMask, points: FloatArray, camera: Intrinsics
-) -> float:
+def usable_pixels(
+    depth_m: Float32Array, masks: Sequence[BranchMask], config: ClusterConfig
+) -> UsablePixels:
+    """Erode at least one mask, and take what has depth in range."""
+    boxes = np.array([(m.left_px, m.top_px, *m.mask.shape) for m in masks], dtype=np.int64)
+    return UsablePixels(
+        *trust.pixels_of(
+            np.concatenate([mask.mask.ravel() for mask in masks]),
+            boxes,
+            np.ascontiguousarray(depth_m, dtype=np.float32),
+            config.erosion_px,
+            config.min_eroded_share,
+            config.nearest_m,
+            config.farthest_m,
+        )
+    )
+
+
+def half_width_m(strip: FloatArray, mask: BranchMask, depth_m: float, camera: Intrinsics) -> float:
     """Return the radius of the round wood whose outline a mask is, from `strip.measure` of it.
 
     The outline of a cylinder lies beside its axis, pi/4 of a radius behind its front on average.
@@ -148,7 +208,7 @@ def half_width_m(
     Args:
         strip: half width in pixels, mean pixel, direction.
         mask: what was measured.
-        points: its front (N, 3) in the camera frame.
+        depth_m: of its front, the median.
         camera: that saw it.
     """
     half_px, u, v, along_u, along_v = strip.tolist()
@@ -156,62 +216,32 @@ def half_width_m(
     ray = ray[0] / np.linalg.norm(ray[0])
     slant = float(ray[1] * along_u - ray[0] * along_v)
     tangent = half_px / camera.fx_px * np.sqrt(1.0 - slant**2)
-    return float(np.median(points[:, 2]) * tangent / (1.0 - np.pi / 4 * tangent))
+    return float(depth_m * tangent / (1.0 - np.pi / 4 * tangent))
 
 
-def follows_profile(along: FloatArray, disparity: FloatArray, config: ClusterConfig) -> BoolArray:
-    """Say which of N pixels lie on the robust profile of disparity (1/m) along a mask's axis."""
-    along = along / max(float(np.abs(along).max()), 1e-12)
-    fit = _best_line(along, disparity, config)
-    design = np.stack([np.ones_like(along), along, along**2], axis=1)
-    for _ in range(6):
-        residual = np.abs(disparity - fit) / tolerance_in_disparity(fit, config)
-        weight = np.where(residual < 1.0, (1.0 - residual**2) ** 2, 0.0)
-        weighted = design * weight[:, None]
-        # A slight pull towards a level line keeps the fit defined where few points agree.
-        normal = weighted.T @ design + 1e-6 * len(along) * np.eye(3)
-        fit = design @ np.linalg.solve(normal, weighted.T @ disparity)
-    return np.asarray(np.abs(disparity - fit) <= tolerance_in_disparity(fit, config))
+def follow_profiles(usable: UsablePixels, config: ClusterConfig) -> BoolArray:
+    """Say which pixels (N,) lie on the robust profile of disparity along their mask."""
+    # The same draws for all masks: none depends on what else is in the view.
+    draws = np.random.default_rng(0).integers(0, 1 << 32, (config.draws, 2))
+    follows: BoolArray = trust.follow_profiles(
+        usable.pixels, usable.start, draws, config.tolerance_m, config.min_points
+    )
+    return follows
 
 
-def tolerance_in_disparity(disparity: FloatArray, config: ClusterConfig) -> FloatArray:
-    """Return what the depth tolerance is in disparity (1/m); constant beyond 1.25 m."""
-    return config.tolerance_m * np.maximum(disparity, 0.8) ** 2
-
-
-def _best_line(along: FloatArray, disparity: FloatArray, config: ClusterConfig) -> FloatArray:
-    """Return the line through two of the pixels that the others agree with best, at all pixels."""
-    pairs = np.random.default_rng(0).integers(0, len(along), (config.draws, 2))
-    run = along[pairs[:, 1]] - along[pairs[:, 0]]
-    pairs, run = pairs[np.abs(run) > 0.3], run[np.abs(run) > 0.3]
-    if len(pairs) == 0:
-        return np.full(len(along), np.median(disparity))
-    slope = (disparity[pairs[:, 1]] - disparity[pairs[:, 0]]) / run
-    lines = disparity[pairs[:, :1]] + slope[:, None] * (along - along[pairs[:, :1]])
-    tolerance = tolerance_in_disparity(np.median(disparity, keepdims=True), config)
-    misfit = np.minimum(np.abs(disparity - lines), tolerance).sum(axis=1)
-    best: FloatArray = lines[np.argmin(misfit)]
-    return best
-
-
-def eroded(mask: BoolArray, erosion_px: int, min_share: float) -> BoolArray:
-    """Shave `erosion_px` off an (h, w) mask, or keep it where too little would be left."""
-    padded = np.pad(mask.astype(np.uint8), erosion_px)
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    inner = cv2.erode(padded, kernel, iterations=erosion_px).astype(bool)
-    inner = inner[erosion_px : -erosion_px or None, erosion_px : -erosion_px or None]
-    return inner if inner.sum() >= min_share * mask.sum() else mask
-
-
-def connected_parts(points: FloatArray, cell_m: float) -> list[IntArray]:
-    """Split (N, 3) points into groups that touch in cells of this size; indices, largest first."""
-    cells = np.floor((points - points.min(axis=0)) / cell_m).astype(np.int64)
-    occupied = np.zeros(cells.max(axis=0) + 1, dtype=bool)
-    occupied[tuple(cells.T)] = True
-    labels, count = label(occupied, structure=np.ones((3, 3, 3)))
-    of_point = labels[tuple(cells.T)]
-    parts = [np.flatnonzero(of_point == number) for number in range(1, count + 1)]
-    return sorted(parts, key=len, reverse=True)
+def _slender_parts(trusted: _Trusted, config: ClusterConfig) -> _Parts:
+    """Split the points of each mask where they do not touch, the largest part first."""
+    part, mask = parts.parts_of(trusted.points_in_camera, trusted.start, config.connect_m)
+    size = np.bincount(part, minlength=len(mask))
+    order = np.lexsort((-size, mask))
+    rank = np.empty(len(order), dtype=np.uint16 if len(order) < 1 << 16 else np.int64)
+    rank[order] = np.arange(len(order))
+    points = trusted.points_in_camera[np.argsort(rank[part], kind="stable")]
+    start = np.append(0, np.cumsum(size[order]))
+    flatness, depth_m = parts.shapes_of(points, start).T
+    return _Parts(
+        points_in_camera=points, start=start, mask=mask[order], flatness=flatness, depth_m=depth_m
+    )
 
 
 def principal_axes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -224,9 +254,3 @@ def principal_axes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     axes = vectors.T[::-1]
     sign = np.sign(axes[np.arange(3), np.argmax(np.abs(axes), axis=1)])
     return np.sqrt(np.maximum(variance[::-1], 0.0)), axes * sign[:, None]
-
-
-def flatness(points: FloatArray) -> float:
-    """Return the ratio of second to first principal deviation: 0 a line, 1 a blob or a dot."""
-    deviation, _ = principal_axes(points)
-    return float(deviation[1] / deviation[0]) if deviation[0] > 1e-9 else 1.0

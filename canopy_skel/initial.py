@@ -9,7 +9,7 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.kernels import forest
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.strands import SmoothingConfig, Strands
-from canopy_skel.voxels import VoxelIndex, voxels_of
+from canopy_skel.voxels import VoxelIndex, grouped, voxels_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,12 +60,9 @@ def initial_skeleton(
 def consolidate(strands: Strands, voxel_size_m: float) -> tuple[FloatArray, FloatArray]:
     """Return one vertex (V, 3) and its radius (V,) per voxel that holds strands, in voxel order."""
     voxels = voxels_of(strands.points_in_base, voxel_size_m)
-    order = np.lexsort(voxels.T[::-1])
-    ordered = voxels[order]
-    first = np.append(True, np.any(ordered[1:] != ordered[:-1], axis=1))[: len(order)]
+    order, starts = grouped(voxels)
     weight = strands.weight[order]
     values = np.column_stack([strands.points_in_base, strands.radius_m])[order] * weight[:, None]
-    starts = np.flatnonzero(first)
     if len(starts) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     means = np.add.reduceat(values, starts, axis=0) / np.add.reduceat(weight, starts)[:, None]

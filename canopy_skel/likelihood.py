@@ -7,10 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canopy_skel.errors import UsageError
-from canopy_skel.geometry import FloatArray
-from canopy_skel.kernels import ellipsoid
+from canopy_skel.geometry import FloatArray, IntArray
+from canopy_skel.kernels import ellipsoid, sums
 from canopy_skel.spline import BranchSpline
 from canopy_skel.voxels import Int32Array, VoxelBlocks, grown
+
+Runs = tuple[IntArray, Int32Array, NDArray[np.float32], NDArray[np.int8]]
+"""Where those of each segment start; the runs; their terms (3, R); places of single voxels."""
 
 BYTES_PER_SLOT = 40
 """Sums, levels and the path search, with room to grow: what the limit counts per slot."""
@@ -26,7 +29,7 @@ LEVELS = 255
 
 def _level_table() -> NDArray[np.uint8]:
     """Return the level, 255 p_l rounded but at least 1, of sums >> LEVEL_SHIFT."""
-    nat = (np.arange(6400) + 0.5) * (1 << ellipsoid.LEVEL_SHIFT) / ellipsoid.UNITS_PER_NAT
+    nat = (np.arange(6400) + 0.5) * (1 << sums.LEVEL_SHIFT) / sums.UNITS_PER_NAT
     return np.maximum(np.round(-LEVELS * np.expm1(-nat)), 1).astype(np.uint8)
 
 
@@ -90,11 +93,11 @@ class LikelihoodGrid:
 
     def empty_probability(self) -> FloatArray:
         """Return q = 1 - p_l (N,), exact where p_l itself would round to 1."""
-        return np.asarray(np.exp(self.units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
+        return np.asarray(np.exp(self.units / -sums.UNITS_PER_NAT), dtype=np.float64)
 
     def probability(self) -> FloatArray:
         """Return p_l (N,)."""
-        return np.asarray(-np.expm1(self.units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
+        return np.asarray(-np.expm1(self.units / -sums.UNITS_PER_NAT), dtype=np.float64)
 
     def centres_in_base(self) -> FloatArray:
         """Return the voxel centres (N, 3) in metres."""
@@ -134,7 +137,7 @@ class LikelihoodMap:
     @property
     def saturated(self) -> bool:
         """Whether some sum has hit its limit: then nothing can be taken off exactly."""
-        return bool((self._sums == ellipsoid.MAX_SUM).any())
+        return bool((self._sums == sums.MAX_SUM).any())
 
     def add(self, segments: Segments) -> None:
         """Update the map by what one view observed.
@@ -151,11 +154,12 @@ class LikelihoodMap:
     def merge(self, grid: LikelihoodGrid) -> None:
         """Add what another map of the same voxel size knows."""
         x, y, z = grid.voxels.T
-        self._cover(np.stack([x, x, y, z, z + 1], axis=1))
+        self.blocks.cover(np.stack([x, y, z, z + 1], axis=1))
+        self._grow()
         slots = self.blocks.slots_of(grid.voxels)
         total = self._sums[slots].astype(np.int64) + grid.units
-        self._sums[slots] = np.minimum(total, ellipsoid.MAX_SUM)
-        places = np.minimum(self._sums[slots] >> ellipsoid.LEVEL_SHIFT, len(LEVEL_TABLE) - 1)
+        self._sums[slots] = np.minimum(total, sums.MAX_SUM)
+        places = np.minimum(self._sums[slots] >> sums.LEVEL_SHIFT, len(LEVEL_TABLE) - 1)
         self.levels[slots] = LEVEL_TABLE[places]
         self._changed.append(slots[self._marks[slots] == 0].astype(np.int32))
         self._marks[slots] = 1
@@ -174,12 +178,12 @@ class LikelihoodMap:
     def probability_at(self, voxels: Int32Array) -> FloatArray:
         """Return p_l (N,) of (N, 3) voxels."""
         units = self._sums[self.blocks.slots_of(voxels)]
-        return np.asarray(-np.expm1(units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
+        return np.asarray(-np.expm1(units / -sums.UNITS_PER_NAT), dtype=np.float64)
 
     def empty_probability_at(self, voxels: Int32Array) -> FloatArray:
         """Return 1 - p_l (N,) of (N, 3) voxels, exact where p_l itself would round to 1."""
         units = self._sums[self.blocks.slots_of(voxels)]
-        return np.asarray(np.exp(units / -ellipsoid.UNITS_PER_NAT), dtype=np.float64)
+        return np.asarray(np.exp(units / -sums.UNITS_PER_NAT), dtype=np.float64)
 
     def grid(self) -> LikelihoodGrid:
         """Return the voxels with p_l > 0 in canonical order."""
@@ -197,26 +201,30 @@ class LikelihoodMap:
         k = self._config.k
         if sign > 0:
             self._check_memory(rows)
-        wide = ellipsoid.rows_of_segments(rows, k)
-        thin = ellipsoid.rows_on_segments(rows)
-        if sign > 0:
-            self._cover(wide)
-            self._cover(thin)
-        for covered, rest in ((wide, False), (thin, True)):
-            changed = ellipsoid.accumulate(
-                rows,
-                k,
-                covered,
-                rest,
-                sign,
-                self._sums,
-                self.levels,
-                LEVEL_TABLE,
-                self._marks,
-                self.blocks.top,
-                self.blocks.origin,
-            )
-            self._changed.append(changed)
+        self.blocks.span(*ellipsoid.bounds_of_segments(rows, k))
+        wide, thin = self._runs(rows)
+        self._grow()
+        slopes, found = _slopes(rows, k), 0
+        seen = np.empty(len(wide[1]) + len(thin[1]), dtype=np.int32)
+        totals = self._sums.reshape(-1, ellipsoid.RUN)
+        levels, marks = (a.reshape(-1, ellipsoid.RUN) for a in (self.levels, self._marks))
+        for runs in (wide, thin):
+            found = sums.accumulate(*runs, slopes, sign, totals, marks, seen, found)
+        self._changed.append(sums.renew_levels(seen[:found], totals, levels, LEVEL_TABLE, marks))
+
+    def _runs(self, rows: FloatArray) -> tuple[Runs, Runs]:
+        """Return the runs of the supports, and of the voxels that the segments pass through."""
+        k, blocks = self._config.k, self.blocks
+        room = ellipsoid.room_for(rows, k)
+        wide = _empty_runs(len(rows), room, 0)
+        count = ellipsoid.runs_of_segments(
+            rows, k, blocks.top, blocks.origin, blocks.count, *wide[:3]
+        )
+        passed = ellipsoid.rows_on_segments(rows)
+        thin = _empty_runs(len(rows), len(passed), len(passed))
+        count = ellipsoid.runs_on_segments(rows, passed, blocks.top, blocks.origin, count, *thin)
+        blocks.number(count)
+        return wide, thin
 
     def _rows(self, segments: Segments) -> FloatArray:
         """Return the segments that have a length as the kernels take them, (S, 9) in voxels."""
@@ -234,8 +242,7 @@ class LikelihoodMap:
             ]
         )
 
-    def _cover(self, rows: Int32Array) -> None:
-        self.blocks.cover(rows[:, 1:])
+    def _grow(self) -> None:
         self.levels = grown(self.levels, self.blocks.slots, 0)
         self._sums = grown(self._sums, self.blocks.slots, 0)
         self._marks = grown(self._marks, self.blocks.slots, 0)
@@ -258,3 +265,19 @@ class LikelihoodMap:
                 f" {needed / 2**30:.1f} GiB of {self._memory_limit_bytes / 2**30:.1f} GiB;"
                 f" {np.ceil(fits * 1e4) / 1e4:g} m fits"
             )
+
+
+def _empty_runs(segments: int, room: int, places: int) -> Runs:
+    return (
+        np.zeros(segments + 1, dtype=np.int64),
+        np.empty(room, dtype=np.int32),
+        np.empty((3, room), dtype=np.float32),
+        np.empty(places, dtype=np.int8),
+    )
+
+
+def _slopes(rows: FloatArray, k: float) -> NDArray[np.float32]:
+    """Return (S, 4): what a step in z adds to slide and place; 1 - c; how 1 - p_o then grows."""
+    across = np.hypot(rows[:, 3], rows[:, 4]) / rows[:, 7]
+    along, confidence = rows[:, 5] / rows[:, 6], rows[:, 8]
+    return np.column_stack([across, along, 1.0 - confidence, confidence / k]).astype(np.float32)

@@ -11,7 +11,7 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.kernels import joins as kernels
 from canopy_skel.kernels import search
 from canopy_skel.likelihood import LikelihoodMap
-from canopy_skel.voxels import Int32Array, grown, voxels_of
+from canopy_skel.voxels import Int32Array, VoxelIndex, distinct, grown, voxels_of
 
 NO_WAY = 27
 
@@ -102,16 +102,17 @@ class PathSearch:
             ends,
             parent,
             len(tree),
-            self._levels,
-            self._map.blocks.neighbours,
-            self._map.blocks.places,
-            self._distance,
-            self._previous,
-            self._label,
-            self._marks,
+            (
+                self._levels,
+                self._map.blocks.neighbours,
+                self._map.blocks.places,
+                self._distance,
+                self._previous,
+                self._label,
+                self._marks,
+            ),
         )
-        paths = np.split(slots, starts[1:]) if len(starts) else []
-        return [self._join(path, int(cost)) for path, cost in zip(paths, totals, strict=True)]
+        return self._joins(slots, starts, totals)
 
     def preview(self) -> list[Join]:
         """Return the joins of a minimum spanning tree of the components: nearly Algorithm 1.
@@ -119,10 +120,11 @@ class PathSearch:
         Paths that were added do not serve as wood for later ones, so ways may run side by side.
         """
         edges, costs, ends, parent = self._cheapest()
-        return [
-            self._join(self._trace(int(edges[i])), int(costs[i]))
-            for i in kernels.span(ends, parent)
-        ]
+        taken = kernels.span(ends, parent)
+        paths = [self._trace(int(edges[i])) for i in taken]
+        starts = np.cumsum([0, *map(len, paths)])[:-1]
+        slots = np.concatenate([np.zeros(0, dtype=np.int64), *paths])
+        return self._joins(slots, starts, costs[taken])
 
     def _grow(self) -> None:
         slots = self._map.blocks.slots
@@ -158,9 +160,11 @@ class PathSearch:
             same = self._sources[known] == sources
             old[same] = self._labels[known[same]]
         labels = self._relabelled(old, component, count)
-        gone = self._sources[~np.isin(self._sources, sources)].astype(np.int32)
+        still = np.searchsorted(sources, self._sources)
+        still[still == len(sources)] = 0
+        gone = self._sources[sources[still] != self._sources] if len(sources) else self._sources
         self._sources, self._labels = sources, labels
-        return gone, sources[labels != old]
+        return gone.astype(np.int32), sources[labels != old]
 
     def _relabelled(self, old: Int32Array, component: IntArray, count: int) -> Int32Array:
         """Give sources (S,) labels, old ones (-1 for none) as far as they tell components apart."""
@@ -224,11 +228,16 @@ class PathSearch:
         path: IntArray = kernels.trace(edge, self._map.blocks.neighbours, self._previous)
         return path
 
-    def _join(self, path: IntArray, units: int) -> Join:
-        voxels = self._map.blocks.voxels_at(path)
+    def _joins(self, slots: IntArray, starts: IntArray, units: IntArray) -> list[Join]:
+        """Return the joins whose slots lie one after the other."""
+        voxels = self._map.blocks.voxels_at(slots)
         empty = self._map.empty_probability_at(voxels)
         steps = -np.log1p(-0.5 * (empty[1:] + empty[:-1]))
-        return Join(cost_nat=float(steps.sum()), units=units, voxels=voxels)
+        bounds = pairwise([*starts.tolist(), len(slots)])
+        return [
+            Join(cost_nat=float(steps[a : b - 1].sum()), units=cost, voxels=voxels[a:b])
+            for (a, b), cost in zip(bounds, units.tolist(), strict=True)
+        ]
 
 
 def add_paths(graph: SkeletonGraph, joins: list[Join], likelihood: LikelihoodMap) -> SkeletonGraph:
@@ -236,13 +245,10 @@ def add_paths(graph: SkeletonGraph, joins: list[Join], likelihood: LikelihoodMap
     if not joins:
         return graph
     voxel_size_m = likelihood.voxel_size_m
-    ends = {tuple(end) for join in joins for end in join.voxels.tolist()}
-    places = voxels_of(graph.vertices_in_base, voxel_size_m).tolist()
-    vertex_at = {
-        place: v
-        for v, voxel in reversed(list(enumerate(places)))
-        if (place := tuple(voxel)) in ends
-    }
+    ends = distinct(np.concatenate([join.voxels[[0, -1]] for join in joins]))
+    places = voxels_of(graph.vertices_in_base, voxel_size_m)
+    at_ends = np.flatnonzero(VoxelIndex(ends).find(places) >= 0)[::-1]
+    vertex_at = dict(zip(map(tuple, places[at_ends].tolist()), at_ends.tolist(), strict=True))
     radius = graph.radius_m.tolist()
     edges: dict[tuple[int, int], None] = {}
     added = []
@@ -283,7 +289,6 @@ def straighten_predicted(graph: SkeletonGraph, steps: int) -> SkeletonGraph:
     at, beside = number[both[:, 0]], both[:, 1]
     at, beside = at[at >= 0], beside[at >= 0]
     for _ in range(steps):
-        total = np.zeros((len(moving), 3))
-        np.add.at(total, at, positions[beside])
-        positions[moving] = total / degree[moving, None]
+        total = [np.bincount(at, axis, minlength=len(moving)) for axis in positions[beside].T]
+        positions[moving] = np.stack(total, axis=1) / degree[moving, None]
     return replace(graph, vertices_in_base=positions)

@@ -12,7 +12,7 @@ import numpy as np
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels import smooth
 from canopy_skel.likelihood import Segments
-from canopy_skel.voxels import Int32Array, VoxelIndex, voxels_of
+from canopy_skel.voxels import Int32Array, VoxelIndex, distinct, grouped, voxels_of
 
 UNITS_PER_M = 1 << 22
 """Fixed point of positions and radii."""
@@ -20,6 +20,7 @@ UNITS_PER_DIRECTION = 1 << 20
 CELLS_PER_VOXEL = 2
 """Along an edge. Coarser, and the strands of one curve may leave out a voxel."""
 _BIAS = 1 << 19
+_AROUND = (np.argwhere(np.ones((3, 3, 3))) - 1).astype(np.int32)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -149,10 +150,8 @@ class StrandMap:
 
     def _stale(self) -> BoolArray:
         """Return which strands have a change within the cells that their smoothing looked at."""
-        around = [o - 1 for o in np.argwhere(np.ones((3, 3, 3)))]
         changed = np.concatenate([np.zeros((0, 3), dtype=np.int32), *self._changed])
-        changed = np.unique(changed, axis=0)
-        near = np.unique(np.concatenate([changed + o for o in around]), axis=0).astype(np.int32)
+        near = distinct((distinct(changed)[:, None] + _AROUND).reshape(-1, 3))
         if len(near) == 0:
             return self._fresh
         index = VoxelIndex(near)
@@ -161,10 +160,8 @@ class StrandMap:
 
     def _smooth(self, points: FloatArray, directions: FloatArray, chosen: IntArray) -> None:
         cell_of = voxels_of(points, self._reach_m)
-        order = np.lexsort(cell_of.T[::-1])  # stable: by key within a cell
-        ordered = cell_of[order]
-        first = np.flatnonzero(np.append(True, np.any(ordered[1:] != ordered[:-1], axis=1)))
-        index = VoxelIndex(ordered[first])
+        order, first = grouped(cell_of)  # by key within a cell
+        index = VoxelIndex(cell_of[order[first]])
         references = np.column_stack([points, directions, self._sums[:, 0]])[order]
         moving, along = points[chosen], directions[chosen]
         for step in range(self._config.steps):

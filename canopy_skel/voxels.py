@@ -17,6 +17,32 @@ def voxels_of(points_in_base: FloatArray, voxel_size_m: float) -> Int32Array:
     return np.floor(points_in_base / voxel_size_m).astype(np.int32)
 
 
+def grouped(voxels: Int32Array) -> tuple[IntArray, IntArray]:
+    """Return the order (N,) that sorts (N, 3) voxels by x, y, z, and where in it each is first met.
+
+    Equal voxels keep their order. Sorting numbers that hold both voxel and place is several times
+    faster than `np.lexsort`.
+    """
+    if len(voxels) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    bits, low = len(voxels).bit_length(), voxels.min(axis=0).astype(np.int64)
+    span = voxels.max(axis=0) - low + 1
+    if float(np.prod(span.astype(np.float64))) * 2.0**bits >= 2.0**63:
+        order = np.asarray(np.lexsort(voxels.T[::-1]))
+        steps = np.abs(np.diff(voxels[order], axis=0)).sum(axis=1)
+        return order, np.append(0, 1 + np.flatnonzero(steps))
+    x, y, z = (voxels - low).T
+    keys = ((x * span[1] + y) * span[2] + z) << bits | np.arange(len(voxels))
+    keys.sort()
+    return keys & ((1 << bits) - 1), np.append(0, 1 + np.flatnonzero(np.diff(keys >> bits)))
+
+
+def distinct(voxels: Int32Array) -> Int32Array:
+    """Return each of (N, 3) voxels once, in order."""
+    order, starts = grouped(voxels)
+    return voxels[order[starts]]
+
+
 def grown(array: NDArray[Scalar], length: int, fill: int) -> NDArray[Scalar]:
     """Return the array with room for `length` entries, in doubling steps; new ones are `fill`."""
     if length <= len(array):
@@ -53,10 +79,14 @@ class VoxelBlocks:
         """Allocate the blocks that rows (R, 4) of x, y, first z, end z touch."""
         if len(rows) == 0:
             return
-        rows, before = np.ascontiguousarray(rows), self.count
-        self._span(*blocks.bounds(rows))
-        self.count = blocks.allocate(self.top, self.origin, rows, before)
-        if self.count > before:
+        rows = np.ascontiguousarray(rows)
+        self.span(*blocks.bounds(rows))
+        self.number(blocks.allocate(self.top, self.origin, rows, self.count))
+
+    def number(self, count: int) -> None:
+        """Take over the blocks below `count` that were entered into `top`."""
+        before, self.count = self.count, count
+        if count > before:
             fresh = np.argwhere(self.top >= before)
             self.places = grown(self.places, self.count, 0)
             self.neighbours = grown(self.neighbours, self.count, 0)
@@ -73,7 +103,7 @@ class VoxelBlocks:
         inside = np.stack([slots >> 6 & 7, slots >> 3 & 7, slots & 7], axis=1)
         return np.asarray(self.places[slots >> 9] * 8 + inside, dtype=np.int32)
 
-    def _span(self, low: IntArray, high: IntArray) -> None:
+    def span(self, low: IntArray, high: IntArray) -> None:
         """Grow the top table so that it spans blocks [low, high)."""
         if self.top.size:
             low = np.minimum(low, self.origin)

@@ -33,7 +33,7 @@ from walkthrough import (
     walk_through,
 )
 
-from canopy_skel.cluster import principal_axes, tolerance_in_disparity
+from canopy_skel.cluster import principal_axes
 from canopy_skel.document import Method, build_document
 from canopy_skel.exports.overlay import draw_overlay
 from canopy_skel.exports.palette import OBSERVED_RGB, OCCLUDED_RGB
@@ -91,7 +91,8 @@ def draw_cluster(walk: Walk) -> plt.Figure:
     ax.scatter(along[trusted], disparity[trusted], s=4, color=BLUE, label="trusted")
     grid = np.linspace(along.min(), along.max(), 100)
     fit = np.polyval(np.polyfit(along[trusted], disparity[trusted], 2), grid)
-    tolerance = tolerance_in_disparity(fit, CONFIG.cluster)
+    # The tolerance grows with the square of the distance beyond 1.25 m, as stereo noise does.
+    tolerance = CONFIG.cluster.tolerance_m * np.maximum(fit, 0.8) ** 2
     ax.plot(grid, fit, "k", lw=1.5, label="profile, ± tolerance")
     for side in (-1, 1):
         ax.plot(grid, fit + side * tolerance, "k--", lw=1)

@@ -11,9 +11,9 @@ from canopy_skel.baselines.mst import join_by_spanning_tree
 from canopy_skel.cluster import (
     BranchCluster,
     cluster_branches,
-    eroded,
-    flatness,
-    follows_profile,
+    follow_profiles,
+    principal_axes,
+    usable_pixels,
 )
 from canopy_skel.document import RejectedView, from_json
 from canopy_skel.frame import View
@@ -144,16 +144,12 @@ def busiest_view(walk: Walk) -> View:
 
 def profile_of(one: Instance) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
     """Return rows, columns, place along the mask, disparity and trust of a mask's pixels."""
-    rule, mask = CONFIG.cluster, one.mask
-    v, u = np.nonzero(eroded(mask.mask, rule.erosion_px, rule.min_eroded_share))
-    u, v = u + mask.left_px, v + mask.top_px
-    depth_m = one.view.depth_m[v, u].astype(np.float64)
-    usable = (depth_m >= rule.nearest_m) & (depth_m <= rule.farthest_m)
-    u, v, depth_m = u[usable], v[usable], depth_m[usable]
-    pixels = np.stack([u, v], axis=1).astype(np.float64)
-    centred = pixels - pixels.mean(axis=0)
+    usable = usable_pixels(one.view.depth_m, [one.mask], CONFIG.cluster)
+    u, v, depth_m = usable.pixels.T
+    centred = usable.pixels[:, :2] - usable.pixels[:, :2].mean(axis=0)
     along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
-    return v, u, along, 1.0 / depth_m, follows_profile(along, 1.0 / depth_m, rule)
+    trusted = follow_profiles(usable, CONFIG.cluster)
+    return v.astype(np.int64), u.astype(np.int64), along, 1.0 / depth_m, trusted
 
 
 def telling_instance(walk: Walk) -> Instance:
@@ -162,7 +158,8 @@ def telling_instance(walk: Walk) -> Instance:
     def worth(one: Instance) -> tuple[bool, float]:
         *_, trusted = profile_of(one)
         cut = float(np.mean(~trusted))
-        fits = flatness(one.cluster.points_in_base) < 0.15 and cut >= 0.05
+        deviation, _ = principal_axes(one.cluster.points_in_base)
+        fits = deviation[1] < 0.15 * deviation[0] and cut >= 0.05
         return fits, min(cut, 0.2) * one.spline.radius_m * float(len(trusted)) ** 0.5
 
     return max(walk.instances, key=worth)

@@ -4,7 +4,7 @@ from functools import cache
 from time import thread_time
 
 import numpy as np
-from scene import sections_of_canopy, views_of
+from scene import picture_of, sections_of_canopy, views_of
 
 from canopy_skel.initial import initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments, segments_of
@@ -21,6 +21,12 @@ def clusters_of_views(fragments, views, instances=25, box_m=2.0, wood_m=66.0):
     """The clusters of each view of a synthetic canopy."""
     sections = sections_of_canopy(fragments, wood_m=wood_m, box_m=box_m)
     return views_of(sections, views=views, instances=instances, box_m=box_m)
+
+
+@cache
+def picture(instances):
+    """A view and its masks, for what the clusters of a view cost."""
+    return picture_of(instances)
 
 
 @cache

@@ -29,10 +29,11 @@ def report(quick, _output):
         "ratio", "ours, skeleton after every view",
     )  # fmt: skip
     text = table("Whole replay at 5 mm", head, [row_of(path) for path in paths])
-    return text + (
+    text += (
         "\nObvious: scipy splines, numpy per bounding box, kd-tree smoothing and forest, explicit"
         " graph, a Dijkstra per piece and round (one timed, the rest extrapolated).\n"
     )
+    return text, {}
 
 
 def row_of(path):

@@ -32,7 +32,7 @@ def report(quick, output):
     text = table(
         "Scaling of the update after a view, 5 mm, ms", ("over", "at", *STAGES, "sum"), rows
     )
-    return text + ("\n![The same as curves](bench-scaling.png)\n" if output else "")
+    return text + ("\n![The same as curves](bench-scaling.png)\n" if output else ""), {}
 
 
 def over_views(views):

@@ -1,7 +1,5 @@
 """Each stage from scratch on 70 views: the obvious way, ours, the ratio, a floor."""
 
-import resource
-
 import numpy as np
 from parts import obvious
 from parts.common import (
@@ -27,10 +25,14 @@ HEAD = ("stage", "obvious ms", "ours ms", "ratio", "floor ms", "floor is")
 
 
 def report(quick, _output):
-    texts = []
+    texts, facts = [], {}
     for voxel_mm in (10, 5) if quick else (10, 5, 2.5):
-        texts.append(at_voxel_size(voxel_mm / 1000, 20 if quick else 70))
-    return "\n".join(texts)
+        text, rows = at_voxel_size(voxel_mm / 1000, 70 if voxel_mm > 4 and not quick else 20)
+        texts.append(text)
+        for name, slow, fast, *_ in rows:
+            if slow:
+                facts[name.split(",")[0], voxel_mm] = slow / fast
+    return "\n".join(texts), facts
 
 
 def at_voxel_size(voxel_m, views):
@@ -43,20 +45,15 @@ def at_voxel_size(voxel_m, views):
     rows += skeleton_stages(engine, segments, voxel_m)
     rows += search_stages(engine)
     held_mb = (engine.map.nbytes + engine.search.nbytes) / 2**20
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     title = (
         f"{1000 * voxel_m:g} mm: {views} views, {engine.map.occupied()} voxels in"
         f" {engine.map.blocks.count} blocks"
     )
-    note = (
-        f"Map and search hold {held_mb:.0f} MB. Peak of this process so far, libraries and the"
-        f" obvious ways included: {peak_mb:.0f} MB.\n"
-    )
-    return table(title, HEAD, rows) + "\n" + note
+    return table(title, HEAD, rows) + f"\nMap and search hold {held_mb:.0f} MB.\n", rows
 
 
 def row(name, slow, fast, floor=None, what=None):
-    return (name, slow, fast, f"{slow / fast:.1f} x", floor, what)
+    return (name, slow, fast, f"{slow / fast:.1f} x" if slow else None, floor, what)
 
 
 def least_squares(clusters):
@@ -72,10 +69,11 @@ def least_squares(clusters):
 
 
 def map_update(segments, voxel_m):
-    dense = obvious.DenseMap((-0.5,) * 3, (2.5,) * 3, voxel_m)
-    repeats = 1 if voxel_m < 0.004 else 2
-    slow = np.median([least_ms(lambda one=one: dense.add(one), repeats) for one in segments])
-    dense = None
+    slow = None
+    if voxel_m > 0.004:  # or the dense array would be 7 GB
+        dense = obvious.DenseMap((-0.5,) * 3, (2.5,) * 3, voxel_m)
+        slow = np.median([least_ms(lambda one=one: dense.add(one), 2) for one in segments])
+        dense = None
     fast, support = [], []
     for one in segments:
         engine = Engine(voxel_m)

@@ -11,6 +11,53 @@ Ints = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)
+def joint(
+    end: int,
+    vertex: int,
+    end_points: Floats,
+    end_tangents: Floats,
+    vertex_end: Ints,
+    points: Floats,
+    reach_m: float,
+) -> tuple[float, int, int]:
+    """Return ranking, kind (0 end to end, 1 to a side) and other end (or -1) of a joint.
+
+    The ranking is inf where the vertex is out of reach, or behind the end.
+    """
+    gx = points[vertex, 0] - end_points[end, 0]
+    gy = points[vertex, 1] - end_points[end, 1]
+    gz = points[vertex, 2] - end_points[end, 2]
+    squared = gx * gx + gy * gy + gz * gz
+    if squared > reach_m * reach_m:
+        return np.inf, 1, -1
+    gap = max(math.sqrt(squared), 1e-9)
+    ax, ay, az = end_tangents[end]
+    cos_a = (ax * gx + ay * gy + az * gz) / gap
+    if cos_a < -0.5 and gap > 0.03:
+        return np.inf, 1, -1
+    kind, other, turn = 1, -1, 0.4
+    for side in range(2):
+        e = vertex_end[vertex, side]
+        if e >= 0:
+            bx, by, bz = end_tangents[e]
+            cost = 0.5 * (1.0 + (bx * gx + by * gy + bz * gz) / gap)
+            if other < 0 or cost < turn:
+                kind, other, turn = 0, e, cost
+    return gap * (1.0 + 1.5 * (1.0 - cos_a) + turn), kind, other
+
+
+@njit(cache=True, nogil=True)
+def least(best: Floats, chosen: Ints) -> tuple[int, int]:
+    """Return row and column of the least entry in the chosen rows, row -1 if all are inf."""
+    low, row, column = np.inf, -1, 0
+    for r in chosen:
+        for kind in range(2):
+            if best[r, kind] < low:
+                low, row, column = best[r, kind], r, kind
+    return row, column
+
+
+@njit(cache=True, nogil=True)
 def link_candidates(
     end_points: Floats,
     end_tangents: Floats,
@@ -43,46 +90,21 @@ def link_candidates(
             c = component[j]
             if c == end_component[i]:
                 continue
-            gx = points[j, 0] - end_points[i, 0]
-            gy = points[j, 1] - end_points[i, 1]
-            gz = points[j, 2] - end_points[i, 2]
-            squared = gx * gx + gy * gy + gz * gz
-            if squared > reach_m * reach_m:
-                continue
-            gap = max(math.sqrt(squared), 1e-9)
-            ax, ay, az = end_tangents[i]
-            cos_a = (ax * gx + ay * gy + az * gz) / gap
-            if cos_a < -0.5 and gap > 0.03:
+            score, kind, other = joint(i, j, end_points, end_tangents, vertex_end, points, reach_m)
+            if score == np.inf:
                 continue
             if not (best[c, 0] < np.inf or best[c, 1] < np.inf):
                 touched[count] = c
                 count += 1
-            kind, other, turn = 1, -1, 0.4
-            for side in range(2):
-                e = vertex_end[j, side]
-                if e >= 0:
-                    bx, by, bz = end_tangents[e]
-                    cost = 0.5 * (1.0 + (bx * gx + by * gy + bz * gz) / gap)
-                    if other < 0 or cost < turn:
-                        kind, other, turn = 0, e, cost
-            score = gap * (1.0 + 1.5 * (1.0 - cos_a) + turn)
             if score < best[c, kind]:
                 best[c, kind], best_vertex[c, kind], best_other[c, kind] = score, j, other
-        taken = 0
-        while taken < most:
-            low, low_c, low_kind = np.inf, -1, 0
-            for t in range(count):
-                for kind in range(2):
-                    if best[touched[t], kind] < low:
-                        low, low_c, low_kind = best[touched[t], kind], touched[t], kind
-            if low_c < 0:
+        for _ in range(most):
+            c, kind = least(best, touched[:count])
+            if c < 0:
                 break
-            ends[found], vertices[found] = i, best_vertex[low_c, low_kind]
-            others[found], ranks[found] = best_other[low_c, low_kind], low
-            best[low_c, low_kind] = np.inf
+            ends[found], vertices[found] = i, best_vertex[c, kind]
+            others[found], ranks[found] = best_other[c, kind], best[c, kind]
+            best[c, kind] = np.inf
             found += 1
-            taken += 1
-        for t in range(count):
-            best[touched[t], 0] = np.inf
-            best[touched[t], 1] = np.inf
+        best[touched[:count]] = np.inf
     return ends[:found], vertices[:found], others[:found], ranks[:found]

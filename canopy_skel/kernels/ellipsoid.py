@@ -1,9 +1,13 @@
-"""Which voxels a segment's likelihood ellipsoid covers, and what it adds to them (paper eq. 1).
+"""Which voxels a segment's likelihood ellipsoid covers (paper eq. 1), as runs.
 
 Voxel (x, y, z) covers [x, x + 1) voxel sizes in base; all lengths here are in voxels. A segment is
-a row (9,): start, unit axis, length, radius, confidence. Sums are integers, so the order of
-segments and views does not matter, to the bit, and what was added can be taken off again. The
-logarithm is made of +, *, / alone: the same bits on every machine.
+a row (9,): start, unit axis, length, radius, confidence. A run is eight voxels in a row along z in
+one block, slots 8 run to 8 run + 7.
+
+In a row along z, (d_r / r)^2 = gap + slide^2: gap is constant, where the row and the axis are
+closest, and slide linear in z. The place along the segment, 0 at its start and 1 at its end, is
+linear too. So nothing cancels for long thin segments, and what a voxel gets is a function of the
+segment and the voxel alone.
 """
 
 import math
@@ -14,24 +18,20 @@ from numpy.typing import NDArray
 
 from canopy_skel.kernels.blocks import slot_of
 
-Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+Float32s = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
+Line = tuple[float, float, float]
+Shape = tuple[float, float, float, float, float, float, float, float]
 
-UNITS_PER_NAT = 65536
-"""Fixed point of the map: -log(1 - p) in units of 1/65536 nat."""
-MAX_SUM = 1 << 30
-"""Sums saturate here (16384 nat): room for one more addition below the int32 limit."""
-LEVEL_SHIFT = 6
-"""Levels are read off a table at sum >> 6: steps of 1/1024 nat."""
-BATCH = 4096
-LONGEST_ROW = 512
+RUN = 8
+"""Voxels of a run."""
 
 
 @njit("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64)", cache=True, nogil=True)
 def box_of(segments: Floats, i: int, reach: float, dimension: int) -> tuple[int, int]:
-    """Return [first, end) voxel of segment i's support along x (0) or y (1)."""
+    """Return [first, end) voxel of segment i's support along x (0), y (1) or z (2)."""
     start, axis = segments[i, dimension], segments[i, 3 + dimension]
     near = start - axis * reach * segments[i, 6]
     far = start + axis * (reach + 1.0) * segments[i, 6]
@@ -39,82 +39,215 @@ def box_of(segments: Floats, i: int, reach: float, dimension: int) -> tuple[int,
     return math.floor(min(near, far) - margin), math.floor(max(near, far) + margin) + 1
 
 
+@njit("int64[:,::1](float64[:,::1], float64)", cache=True, nogil=True)
+def bounds_of_segments(segments: Floats, reach: float) -> Ints:
+    """Return the first and the end block (2, 3) of all supports."""
+    span = np.empty((2, 3), dtype=np.int64)
+    for j in range(3):
+        for i in range(len(segments)):
+            first, end = box_of(segments, i, reach, j)
+            first, end = first >> 3, ((end - 1) >> 3) + 1
+            span[0, j] = first if i == 0 else min(span[0, j], first)
+            span[1, j] = end if i == 0 else max(span[1, j], end)
+    return span
+
+
 @njit("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64)", cache=True, nogil=True)
 def strip_of(segments: Floats, i: int, reach: float, x: int) -> tuple[int, int]:
     """Return [first, end) y where the shadow of segment i's cylinder on the xy plane crosses x."""
+    first, end = box_of(segments, i, reach, 1)
     ax, ay = segments[i, 3], segments[i, 4]
     if abs(ax) < 1e-6:
-        return -(1 << 40), 1 << 40
+        return first, end
     middle = segments[i, 1] + ay / ax * (x + 0.5 - segments[i, 0])
     margin = abs(reach * segments[i, 7] * math.sqrt(ax * ax + ay * ay) / ax)
-    return math.floor(middle - margin - 0.5), math.floor(middle + margin - 0.5) + 2
+    low, high = math.floor(middle - margin - 0.5), math.floor(middle + margin - 0.5) + 2
+    return max(first, low), min(end, high)
 
 
-@njit("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64, int64)", cache=True, nogil=True)
-def row_range(segments: Floats, i: int, reach: float, x: int, y: int) -> tuple[int, int]:
-    """Return [first, end) z of the row of voxel centres (x, y) inside segment i's support box.
+@njit("UniTuple(float64, 8)(float64[:,::1], int64)", error_model="numpy", cache=True, nogil=True)
+def shape_of(segments: Floats, i: int) -> Shape:
+    """Return what all rows along a segment share.
 
-    The box is the cylinder d_r <= reach * radius cut to d_l <= reach * length; it contains the
-    ellipsoid. Empty rows give first >= end.
+    The sine of its axis with z, what a step in z adds to the slide and to the place, what a length
+    and a radius are divided by, and the inverses of the first three, 0 for that of 0.
     """
-    ax, ay, az, length = segments[i, 3], segments[i, 4], segments[i, 5], segments[i, 6]
-    wx, wy = x + 0.5 - segments[i, 0], y + 0.5 - segments[i, 1]
+    tilt = math.sqrt(segments[i, 3] * segments[i, 3] + segments[i, 4] * segments[i, 4])
+    per_length, per_radius = 1.0 / segments[i, 6], 1.0 / segments[i, 7]
+    place_step = segments[i, 5] * per_length
+    per_tilt, per_slide, per_place = 0.0, 0.0, 0.0
+    if tilt > 1e-12:
+        per_tilt, per_slide = 1.0 / tilt, segments[i, 7] / tilt
+    else:
+        tilt = 0.0
+    if abs(place_step) > 1e-12:
+        per_place = 1.0 / place_step
+    return (
+        tilt, tilt * per_radius, place_step, per_length, per_radius, per_tilt, per_slide, per_place
+    )  # fmt: skip
+
+
+@njit(
+    "UniTuple(float64, 3)(float64[:,::1], int64, UniTuple(float64, 8), int64, int64)",
+    cache=True,
+    nogil=True,
+)
+def line_of(segments: Floats, i: int, shape: Shape, x: int, y: int) -> Line:
+    """Return gap, and slide and place at z = 0, of the row of voxels at x, y."""
+    tilt, _, _, per_length, per_radius, per_tilt, _, _ = shape
+    ax, ay, az = segments[i, 3], segments[i, 4], segments[i, 5]
+    wx, wy, wz = x + 0.5 - segments[i, 0], y + 0.5 - segments[i, 1], 0.5 - segments[i, 2]
     across = wx * ax + wy * ay
-    # |w|^2 - (w . axis)^2 <= (reach * radius)^2 is a quadratic a z^2 + 2 b z + c <= 0 in z.
-    a = 1.0 - az * az
-    b = -across * az
-    c = wx * wx + wy * wy - across * across - (reach * segments[i, 7]) ** 2
-    low, high = -1e9, 1e9
-    if a > 1e-12:
-        root = b * b - a * c
-        if root < 0.0:
-            return 0, 0
-        low, high = (-b - math.sqrt(root)) / a, (-b + math.sqrt(root)) / a
-    elif c > 0.0:
+    place = (across + wz * az) * per_length
+    if tilt == 0.0:
+        return (wx * wx + wy * wy) * per_radius * per_radius, 0.0, place
+    gap = (wx * ay - wy * ax) * per_tilt * per_radius
+    return gap * gap, (wz * tilt - across * per_tilt * az) * per_radius, place
+
+
+@njit(
+    "UniTuple(int64, 2)(UniTuple(float64, 3), UniTuple(float64, 8), float64)",
+    cache=True,
+    nogil=True,
+)
+def reach_of(line: Line, shape: Shape, k: float) -> tuple[int, int]:
+    """Return [first, end) z of the voxels of a row that may lie inside the support.
+
+    Empty rows give first >= end.
+    """
+    gap, slide, place = line
+    _, _, place_step, _, _, _, per_slide, per_place = shape
+    low, high, left = -1e9, 1e9, k * k - gap
+    if per_slide > 0.0:
+        # How far the row stays beyond the ends narrows it, as it does the ellipsoid.
+        middle, spread = place - slide * per_slide * place_step, k * per_slide * abs(place_step)
+        beyond = max(0.0, max(-middle, middle - 1.0) - spread)
+        left -= beyond * beyond
+    if left <= 0.0:
         return 0, 0
-    if abs(az) > 1e-12:
-        near = (-reach * length - across) / az
-        far = ((reach + 1.0) * length - across) / az
+    if per_slide > 0.0:
+        root = math.sqrt(left)
+        low, high = (-root - slide) * per_slide, (root - slide) * per_slide
+    if per_place != 0.0:
+        near, far = (-k - place) * per_place, (k + 1.0 - place) * per_place
         low, high = max(low, min(near, far)), min(high, max(near, far))
-    elif not -reach * length <= across <= (reach + 1.0) * length:
+    elif not -k <= place <= k + 1.0:
         return 0, 0
-    return math.ceil(segments[i, 2] + low - 0.5), math.floor(segments[i, 2] + high - 0.5) + 1
+    return math.ceil(low), math.floor(high) + 1
+
+
+@njit("int64(float64[:,::1], float64)", error_model="numpy", cache=True, nogil=True)
+def room_for(segments: Floats, k: float) -> int:
+    """Return how many runs the supports have at most."""
+    room = 0
+    for i in range(len(segments)):
+        low, high = box_of(segments, i, k, 2)
+        chord, per_slide = float(high - low), shape_of(segments, i)[6]
+        if per_slide > 0.0:
+            chord = min(chord, 2.0 * k * per_slide)
+        first, end = box_of(segments, i, k, 0)
+        for x in range(first, end):
+            y0, y1 = strip_of(segments, i, k, x)
+            room += max(0, y1 - y0) * (2 + int(chord) // RUN)
+    return room
+
+
+@njit(
+    "int64(float64[:,::1], float64, int32[:,:,::1], int64[::1], int64, int64[::1], int32[::1],"
+    " float32[:,::1])",
+    cache=True,
+    nogil=True,
+)
+def runs_of_segments(
+    segments: Floats,
+    k: float,
+    top: Int32s,
+    origin: Ints,
+    blocks: int,
+    starts: Ints,
+    runs: Int32s,
+    terms: Float32s,
+) -> int:
+    """Write the runs that cover all supports, and gap, slide and place (3, R) at their first voxel.
+
+    Those of segment i are starts[i] up to starts[i + 1]. Blocks that are touched first are numbered
+    from `blocks` on in `top`, which must span the supports; returns the new number.
+    """
+    count = 0
+    for i in range(len(segments)):
+        starts[i] = count
+        shape = shape_of(segments, i)
+        x0, x1 = box_of(segments, i, k, 0)
+        for x in range(x0, x1):
+            y0, y1 = strip_of(segments, i, k, x)
+            bx = (x >> 3) - origin[0]
+            for y in range(y0, y1):
+                line = line_of(segments, i, shape, x, y)
+                z0, z1 = reach_of(line, shape, k)
+                by, inside = (y >> 3) - origin[1], (x & 7) << 3 | (y & 7)
+                for bz in range(z0 >> 3, ((z1 - 1) >> 3) + 1 if z0 < z1 else z0 >> 3):
+                    block = int(top[bx, by, bz - origin[2]])
+                    if block == 0:
+                        block, blocks = blocks, blocks + 1
+                        top[bx, by, bz - origin[2]] = block
+                    runs[count] = block << 6 | inside
+                    terms[0, count] = line[0]
+                    terms[1, count] = line[1] + shape[1] * (bz << 3)
+                    terms[2, count] = line[2] + shape[2] * (bz << 3)
+                    count += 1
+    starts[len(segments)] = count
+    return blocks
+
+
+@njit(
+    "int64(float64[:,::1], int32[:,::1], int32[:,:,::1], int64[::1], int64, int64[::1], int32[::1],"
+    " float32[:,::1], int8[::1])",
+    cache=True,
+    nogil=True,
+)
+def runs_on_segments(
+    segments: Floats,
+    rows: Int32s,
+    top: Int32s,
+    origin: Ints,
+    blocks: int,
+    starts: Ints,
+    runs: Int32s,
+    terms: Float32s,
+    places: NDArray[np.int8],
+) -> int:
+    """Do the same for rows of one voxel (R, 5), in order; write its place in the run as well."""
+    at = 0
+    for i in range(len(segments)):
+        starts[i] = at
+        shape = shape_of(segments, i)
+        while at < len(rows) and rows[at, 0] == i:
+            x, y, z = int(rows[at, 1]), int(rows[at, 2]), int(rows[at, 3])
+            bx, by, bz = (x >> 3) - origin[0], (y >> 3) - origin[1], (z >> 3) - origin[2]
+            if top[bx, by, bz] == 0:
+                top[bx, by, bz] = blocks
+                blocks += 1
+            runs[at], places[at] = slot_of(top, origin, x, y, z) >> 3, z & 7
+            line = line_of(segments, i, shape, x, y)
+            terms[0, at] = line[0]
+            terms[1, at] = line[1] + shape[1] * (z & ~7)
+            terms[2, at] = line[2] + shape[2] * (z & ~7)
+            at += 1
+    starts[len(segments)] = at
+    return blocks
 
 
 @njit("int32[:,::1](int32[:,::1], int64)", cache=True, nogil=True)
 def resized(rows: Int32s, length: int) -> Int32s:
-    """Return a copy of rows (R, 5) with room for `length`, or their first ones.
+    """Return a copy of rows with room for `length`, or their first ones.
 
     Loops, here and below: assigning to slices takes the compiler seconds.
     """
-    copy = np.empty((length, 5), dtype=np.int32)
+    copy = np.empty((length, rows.shape[1]), dtype=np.int32)
     for r in range(min(len(rows), length)):
-        for i in range(5):
+        for i in range(rows.shape[1]):
             copy[r, i] = rows[r, i]
     return copy
-
-
-@njit("int32[:,::1](float64[:,::1], float64)", cache=True, nogil=True)
-def rows_of_segments(segments: Floats, reach: float) -> Int32s:
-    """Return (R, 5) int32 rows (segment, x, y, first z, end z) that cover all supports."""
-    count = 0
-    rows = np.empty((1 << 15, 5), dtype=np.int32)
-    for i in range(len(segments)):
-        x0, x1 = box_of(segments, i, reach, 0)
-        box_y0, box_y1 = box_of(segments, i, reach, 1)
-        for x in range(x0, x1):
-            y0, y1 = strip_of(segments, i, reach, x)
-            for y in range(max(y0, box_y0), min(y1, box_y1)):
-                z0, z1 = row_range(segments, i, reach, x, y)
-                while z0 < z1:
-                    if count == len(rows):
-                        rows = resized(rows, 2 * count)
-                    end = min(z1, z0 + LONGEST_ROW)
-                    rows[count, 0], rows[count, 1], rows[count, 2] = i, x, y
-                    rows[count, 3], rows[count, 4] = z0, end
-                    count += 1
-                    z0 = end
-    return resized(rows, count)
 
 
 @njit("int64(float64[:,::1], int64, int32[:,::1], int64)", cache=True, nogil=True)
@@ -161,174 +294,3 @@ def rows_on_segments(segments: Floats) -> Int32s:
     for i in range(len(segments)):
         count = rows_on_segment(segments, i, rows, count)
     return resized(rows, count)
-
-
-@njit(
-    "void(float64[::1], float64[::1], int64[::1], int64[::1], int64, float64)",
-    cache=True,
-    nogil=True,
-)
-def units_of(
-    squared: Floats, confidence: Floats, bits: Ints, units: Ints, count: int, k: float
-) -> None:
-    """Write round(-log(1 - p_o)) in map units; `bits` must be a view of `squared`.
-
-    p_o = c (1 - sqrt(squared) / k), not below 0 (paper eq. 1). 1 - p_o = m 2^e with m in
-    [sqrt(1/2), sqrt(2)); log m = 2 artanh((m - 1) / (m + 1)) as a series. Loops without branches
-    or calls, which compilers turn into vector instructions.
-    """
-    for i in range(count):
-        p = confidence[i] - confidence[i] * math.sqrt(squared[i]) / k
-        squared[i] = 1.0 - max(p, 0.0)
-    for i in range(count):
-        exponent = (bits[i] - 0x3FE6A09E667F3BCD) >> 52
-        units[i] = exponent
-        bits[i] -= exponent << 52
-    for i in range(count):
-        s = (squared[i] - 1.0) / (squared[i] + 1.0)
-        t = s * s
-        series = 1.0 / 19.0
-        series = series * t + 1.0 / 17.0
-        series = series * t + 1.0 / 15.0
-        series = series * t + 1.0 / 13.0
-        series = series * t + 1.0 / 11.0
-        series = series * t + 1.0 / 9.0
-        series = series * t + 1.0 / 7.0
-        series = series * t + 1.0 / 5.0
-        series = series * t + 1.0 / 3.0
-        log_m = 2.0 * s + 2.0 * s * t * series
-        nat = -(log_m + units[i] * 0.6931471805599453)
-        units[i] = int(nat * UNITS_PER_NAT + 0.5)
-
-
-@njit(
-    "int64(float64[:,::1], int32[:,::1], int64, float64[::1], float64[::1], int64)",
-    cache=True,
-    nogil=True,
-)
-def measure_row(
-    segments: Floats, rows: Int32s, row: int, squared: Floats, confidence: Floats, at: int
-) -> int:
-    """Write (d_l / l)^2 + (d_r / r)^2 and c of a row's voxels from `at` on; return the end."""
-    i = rows[row, 0]
-    ax, ay, az, length = segments[i, 3], segments[i, 4], segments[i, 5], segments[i, 6]
-    per_length, per_radius = 1.0 / length, 1.0 / segments[i, 7]
-    wx = rows[row, 1] + 0.5 - segments[i, 0]
-    wy = rows[row, 2] + 0.5 - segments[i, 1]
-    wz = rows[row, 3] + 0.5 - segments[i, 2]
-    count = rows[row, 4] - rows[row, 3]
-    for z in range(count):
-        along = wx * ax + wy * ay + (wz + z) * az
-        # The perpendicular part itself, since |w|^2 - along^2 cancels for long thin segments.
-        rx, ry, rz = wx - along * ax, wy - along * ay, wz + z - along * az
-        axial = max(0.0, max(-along, along - length)) * per_length
-        radial = (rx * rx + ry * ry + rz * rz) * per_radius * per_radius
-        squared[at + z] = axial * axial + radial
-        confidence[at + z] = segments[i, 8]
-    return int(at + count)
-
-
-@njit(
-    "int64(int32[:,::1], int64, int64, int64[::1], int64, int32[::1], uint8[::1], uint8[::1],"
-    " uint8[::1], int32[:,:,::1], int64[::1], int32[::1], int64)",
-    cache=True,
-    nogil=True,
-)
-def add_to_rows(
-    rows: Int32s,
-    first: int,
-    end: int,
-    units: Ints,
-    sign: int,
-    sums: Int32s,
-    levels: Bytes,
-    level_table: Bytes,
-    marks: Bytes,
-    top: Int32s,
-    origin: Ints,
-    changed: Int32s,
-    count: int,
-) -> int:
-    """Add units to the voxels of rows [first, end); note once whose level changes; new count."""
-    at = 0
-    highest = len(level_table) - 1
-    for r in range(first, end):
-        slot = 0
-        for z in range(rows[r, 3], rows[r, 4]):
-            if slot == 0 or z & 7 == 0:
-                slot = slot_of(top, origin, rows[r, 1], rows[r, 2], z)
-            else:
-                slot += 1
-            amount = units[at]
-            at += 1
-            if amount == 0:
-                continue
-            total = min(sums[slot] + sign * amount, MAX_SUM)
-            sums[slot] = total
-            level = np.uint8(0)
-            if total > 0:
-                level = level_table[min(total >> LEVEL_SHIFT, highest)]
-            if level != levels[slot]:
-                levels[slot] = level
-                if marks[slot] == 0:
-                    marks[slot] = 1
-                    changed[count] = slot
-                    count += 1
-    return count
-
-
-@njit("void(int64[::1], float64[::1], int64)", cache=True, nogil=True)
-def rest_of(units: Ints, confidence: Floats, count: int) -> None:
-    """Replace units by what is missing from them to p_o = c (rule 1)."""
-    for i in range(count):
-        units[i] = int(-math.log1p(-confidence[i]) * UNITS_PER_NAT + 0.5) - units[i]
-
-
-@njit(
-    "int32[::1](float64[:,::1], float64, int32[:,::1], boolean, int64, int32[::1], uint8[::1],"
-    " uint8[::1], uint8[::1], int32[:,:,::1], int64[::1])",
-    cache=True,
-    nogil=True,
-)
-def accumulate(
-    segments: Floats,
-    k: float,
-    rows: Int32s,
-    rest: bool,
-    sign: int,
-    sums: Int32s,
-    levels: Bytes,
-    level_table: Bytes,
-    marks: Bytes,
-    top: Int32s,
-    origin: Ints,
-) -> Int32s:
-    """Add (sign 1) or take off (-1) what segments tell about the voxels of their rows.
-
-    That is -log(1 - p_o), or with `rest` what is left from there to p_o = c: rule 1, for rows on
-    the segments. Returns the slots whose level changed and that were not marked yet; they are
-    marked now.
-    """
-    voxels = 0
-    for r in range(len(rows)):
-        voxels += rows[r, 4] - rows[r, 3]
-    changed = np.empty(voxels, dtype=np.int32)
-    squared, confidence = np.zeros(BATCH), np.zeros(BATCH)
-    bits, units = squared.view(np.int64), np.zeros(BATCH, dtype=np.int64)
-    found = first = filled = 0
-    for r in range(len(rows) + 1):
-        if r == len(rows) or filled + rows[r, 4] - rows[r, 3] > BATCH:
-            units_of(squared, confidence, bits, units, filled, k)
-            if rest:
-                rest_of(units, confidence, filled)
-            found = add_to_rows(
-                rows, first, r, units, sign, sums, levels, level_table, marks, top, origin,
-                changed, found,
-            )  # fmt: skip
-            first, filled = r, 0
-        if r < len(rows):
-            filled = measure_row(segments, rows, r, squared, confidence, filled)
-    result = np.empty(found, dtype=np.int32)
-    for i in range(found):
-        result[i] = changed[i]
-    return result

@@ -41,13 +41,9 @@ def diagonalise(matrix: Floats, vectors: Floats) -> None:
                     vectors[i, p], vectors[i, q] = c * a - s * b, s * a + c * b
 
 
-@njit("void(float64[:,::1], int64, int64, float64[:,::1], float64[::1])", cache=True, nogil=True)
-def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Floats) -> None:
-    """Write the principal axes of points [first, end) as rows, longest first, and their mean.
-
-    The sign of an axis is canonical: its largest component is positive.
-    """
-    spread, vectors = np.zeros((3, 3)), np.empty((3, 3))
+@njit("void(float64[:,::1], int64, int64, float64[::1], float64[:,::1])", cache=True, nogil=True)
+def scatter_of(points: Floats, first: int, end: int, mean: Floats, spread: Floats) -> None:
+    """Write the mean of points [first, end) and the matrix (3, 3) of their squared deviations."""
     mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
     for n in range(first, end):
         mx, my, mz = mx + points[n, 0], my + points[n, 1], mz + points[n, 2]
@@ -61,6 +57,16 @@ def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Fl
     spread[0, 1] = spread[1, 0] = xy
     spread[0, 2] = spread[2, 0] = xz
     spread[1, 2] = spread[2, 1] = yz
+
+
+@njit("void(float64[:,::1], int64, int64, float64[:,::1], float64[::1])", cache=True, nogil=True)
+def principal_frame(points: Floats, first: int, end: int, axes: Floats, mean: Floats) -> None:
+    """Write the principal axes of points [first, end) as rows, longest first, and their mean.
+
+    The sign of an axis is canonical: its largest component is positive.
+    """
+    spread, vectors = np.empty((3, 3)), np.empty((3, 3))
+    scatter_of(points, first, end, mean, spread)
     diagonalise(spread, vectors)
     used = np.zeros(3)
     for row in range(3):

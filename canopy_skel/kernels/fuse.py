@@ -29,6 +29,62 @@ def cell_keys(points: Floats, cell_m: float) -> Ints:
 
 
 @njit(cache=True, nogil=True)
+def near(
+    point: Floats, reach: float, references: Floats, keys: Ints, cell_m: float, found: Ints
+) -> int:
+    """Write which references (R, 3), sorted by the `keys` of their cells, are within reach."""
+    px, py, pz = point
+    count = 0
+    for x in range(math.floor((px - reach) / cell_m), math.floor((px + reach) / cell_m) + 1):
+        for y in range(math.floor((py - reach) / cell_m), math.floor((py + reach) / cell_m) + 1):
+            low = cell_key(x, y, math.floor((pz - reach) / cell_m))
+            high = cell_key(x, y, math.floor((pz + reach) / cell_m))
+            j = np.searchsorted(keys, low)
+            while j < len(keys) and keys[j] <= high:
+                wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
+                if wx * wx + wy * wy + wz * wz <= reach * reach:
+                    found[count] = j
+                    count += 1
+                j += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def bits_in(number: int) -> int:
+    """Return how many bits of a number are set."""
+    count = 0
+    while number:
+        number &= number - 1
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def draw(
+    offset: tuple[float, float, float],
+    heading: tuple[float, float, float],
+    total: float,
+    point: Floats,
+    direction: Floats,
+) -> bool:
+    """Move a point by the mean of offsets, across the mean heading, which becomes its direction.
+
+    False, and nothing is done, where the headings cancel out.
+    """
+    ex, ey, ez = heading
+    norm = math.sqrt(ex * ex + ey * ey + ez * ez)
+    if norm <= 1e-9:
+        return False
+    ex, ey, ez = ex / norm, ey / norm, ez / norm
+    ox, oy, oz = offset[0] / total, offset[1] / total, offset[2] / total
+    along = ox * ex + oy * ey + oz * ez
+    point[0], point[1] = point[0] + ox - along * ex, point[1] + oy - along * ey
+    point[2] = point[2] + oz - along * ez
+    direction[0], direction[1], direction[2] = ex, ey, ez
+    return True
+
+
+@njit(cache=True, nogil=True)
 def shift_across(
     points: Floats,
     directions: Floats,
@@ -49,68 +105,35 @@ def shift_across(
     """Move points (P, 3) to the weighted mean of the references, across their direction only.
 
     References (R, 3) lie sorted by the `keys` of their cells of `cell_m`. The bandwidth is the
-    larger of `bandwidth_m`
-    and a share of the point's radius; references count within twice that and with |cos| of the
-    angle between the directions of at least `min_cosine`. Returns the moved points, the mean
-    directions, and the support (P, SUPPORT).
+    larger of `bandwidth_m` and a share of the point's radius; references count within twice that
+    and with |cos| of the angle between the directions of at least `min_cosine`. Returns the moved
+    points, the mean directions, and the support (P, SUPPORT).
     """
-    moved = points.copy()
-    turned = directions.copy()
-    support = np.zeros((len(points), SUPPORT))
+    moved, turned = points.copy(), directions.copy()
+    support, found = np.zeros((len(points), SUPPORT)), np.zeros(len(references), dtype=np.int64)
     for i in range(len(points)):
         px, py, pz = points[i]
-        dx, dy, dz = directions[i]
         width = max(bandwidth_m, radius_share * radii[i])
-        reach = 2.0 * width
-        total = ox = oy = oz = ex = ey = ez = r = mean_p = masks = 0.0
-        largest, bits = 0.0, 0
-        for x in range(math.floor((px - reach) / cell_m), math.floor((px + reach) / cell_m) + 1):
-            for y in range(
-                math.floor((py - reach) / cell_m), math.floor((py + reach) / cell_m) + 1
-            ):
-                low = cell_key(x, y, math.floor((pz - reach) / cell_m))
-                high = cell_key(x, y, math.floor((pz + reach) / cell_m))
-                j = np.searchsorted(keys, low) - 1
-                while j + 1 < len(keys) and keys[j + 1] <= high:
-                    j += 1
-                    wx = references[j, 0] - px
-                    wy = references[j, 1] - py
-                    wz = references[j, 2] - pz
-                    squared = wx * wx + wy * wy + wz * wz
-                    if squared > reach * reach:
-                        continue
-                    rx, ry, rz = reference_directions[j]
-                    cosine = dx * rx + dy * ry + dz * rz
-                    if abs(cosine) < min_cosine:
-                        continue
-                    weight = weights[j] * math.exp(-0.5 * squared / (width * width))
-                    signed = weight if cosine > 0.0 else -weight
-                    total += weight
-                    ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
-                    ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
-                    r += weight * reference_radii[j]
-                    mean_p += weight * probability[j]
-                    largest = max(largest, probability[j])
-                    bits |= view_bits[j]
-                    if not fragment[j]:
-                        masks += weight
-        norm = math.sqrt(ex * ex + ey * ey + ez * ez)
-        if total > 0.0 and norm > 1e-9:
-            ex, ey, ez = ex / norm, ey / norm, ez / norm
-            ox, oy, oz = ox / total, oy / total, oz / total
-            along = ox * ex + oy * ey + oz * ez
-            moved[i] = (px + ox - along * ex, py + oy - along * ey, pz + oz - along * ez)
-            turned[i] = (ex, ey, ez)
-            support[i, 0] = total
-            support[i, 1] = r / total
-            support[i, 2] = mean_p / total
-            support[i, 3] = largest
-            views = 0
-            while bits:
-                bits &= bits - 1
-                views += 1
-            support[i, 4] = views
-            support[i, 5] = masks / total
+        total, bits = 0.0, 0
+        ox = oy = oz = ex = ey = ez = r = mean_p = masks = largest = 0.0
+        for j in found[: near(points[i], 2.0 * width, references, keys, cell_m, found)]:
+            rx, ry, rz = reference_directions[j]
+            cosine = directions[i, 0] * rx + directions[i, 1] * ry + directions[i, 2] * rz
+            if abs(cosine) < min_cosine:
+                continue
+            wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
+            weight = weights[j] * math.exp(-0.5 * (wx * wx + wy * wy + wz * wz) / (width * width))
+            signed = weight if cosine > 0.0 else -weight
+            total += weight
+            ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
+            ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
+            r += weight * reference_radii[j]
+            mean_p += weight * probability[j]
+            largest, bits = max(largest, probability[j]), bits | view_bits[j]
+            masks += 0.0 if fragment[j] else weight
+        if total > 0.0 and draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i]):
+            support[i, :3] = (total, r / total, mean_p / total)
+            support[i, 3:] = (largest, float(bits_in(bits)), masks / total)
     return moved, turned, support
 
 

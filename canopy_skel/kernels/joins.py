@@ -4,18 +4,23 @@ A border is an edge between voxels of different labels; the way over it costs th
 two ends and itself. It is written as slot * 32 + direction, from the lower to the higher voxel.
 """
 
-import heapq
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from canopy_skel.kernels.blocks import CENTRE, SLOTS, beside, key_of
+from canopy_skel.kernels.heap import pop, pop_row, push, push_row, with_room
 from canopy_skel.kernels.search import COSTS, LENGTHS, UNREACHED
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
+Forest = tuple[Bytes, Int32s, Int32s, Int32s, Bytes, Int32s, Bytes]
+"""By slot: level, then neighbours and places of blocks; distance, previous, label, marks."""
+FOREST = (
+    "Tuple((uint8[::1], int32[:,::1], int32[:,::1], int32[::1], uint8[::1], int32[::1],"
+    " uint8[::1]))"
+)
 
 
 @njit("int64[::1](int64[::1], int64)", cache=True, nogil=True)
@@ -25,6 +30,15 @@ def resized_long(entries: Ints, length: int) -> Ints:
     for i in range(min(len(entries), length)):
         copy[i] = entries[i]
     return copy
+
+
+@njit("int64[::1](int64[::1], int64[::1])", cache=True, nogil=True)
+def joined(entries: Ints, more: Ints) -> Ints:
+    """Return both, one after the other."""
+    both = resized_long(entries, len(entries) + len(more))
+    for i in range(len(more)):
+        both[len(entries) + i] = more[i]
+    return both
 
 
 @njit("int64(int32[::1], int64)", cache=True, nogil=True)
@@ -167,8 +181,10 @@ def note(
 
 @njit("int32[:,::1](int32[:,::1], int64)", cache=True, nogil=True)
 def longer(journal: Int32s, length: int) -> Int32s:
-    """Return a copy of a journal (N, 4) with room for `length` entries."""
-    copy = np.empty((length, 4), dtype=np.int32)
+    """Return a journal (N, 4) with room for `length` entries, a copy if it had none."""
+    if length <= len(journal):
+        return journal
+    copy = np.empty((2 * length, 4), dtype=np.int32)
     for i in range(len(journal)):
         for j in range(4):
             copy[i, j] = journal[i, j]
@@ -196,93 +212,137 @@ def roll_back(
 
 
 @njit(
-    "Tuple((int64[::1], int64[::1], int64[::1], int64))(int64[::1], int64[::1], int64[:,::1],"
-    " int32[::1], int64, uint8[::1], int32[:,::1], int32[:,::1], int32[::1], uint8[::1],"
-    " int32[::1], uint8[::1])",
+    f"int64(int64, int64[::1], int64[:,::1], int32[:,::1], int64, int32[::1], {FOREST})",
+    cache=True,
+    nogil=True,
+)
+def spread(
+    u: int,
+    pending: Ints,
+    borders: Ints,
+    journal: Int32s,
+    noted: int,
+    parent: Int32s,
+    forest: Forest,
+) -> int:
+    """Offer all neighbours of a slot the way through it, and note the borders it is at.
+
+    Heaps and journal must have room for 27 more. Returns the journal's new count.
+    """
+    levels, neighbours, places, distance, previous, label, marks = forest
+    for k in range(27):
+        v = beside(neighbours, u, k)
+        if levels[v] == 0 or k == CENTRE:
+            continue
+        step = int(COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k])
+        through, known = int(distance[u]) + step, int(distance[v])
+        better = through < known or (through == known and 26 - k < previous[v])
+        relabel = through == known and previous[v] == 26 - k
+        if better or relabel:
+            again = through < known or label[v] != label[u]
+            if better or again:
+                noted = note(v, noted, journal, distance, previous, label, marks)
+                distance[v], previous[v], label[v] = through, 26 - k, label[u]
+            if again:
+                marks[v] |= 1
+                push(pending, through << 32 | v)
+        if distance[v] != UNREACHED and (
+            root_of(parent, int(label[u])) != root_of(parent, int(label[v]))
+        ):
+            total = int(distance[u]) + step + int(distance[v])
+            lower, way = (u, k) if k > CENTRE else (v, 26 - k)
+            push_row(borders, total, key_of(places, lower), lower << 5 | way)
+    return noted
+
+
+@njit(f"UniTuple(int64, 2)(int64, int64, int32[::1], {FOREST})", cache=True, nogil=True)
+def joined_by(edge: int, total: int, parent: Int32s, forest: Forest) -> tuple[int, int]:
+    """Return the two components that a border joins, twice the same if it costs this no more."""
+    levels, neighbours, _, distance, _, label, _ = forest
+    u, k = edge >> 5, edge & 31
+    v = beside(neighbours, u, k)
+    a, b = root_of(parent, int(label[u])), root_of(parent, int(label[v]))
+    step = int(COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k])
+    return (a, b) if total == int(distance[u]) + step + int(distance[v]) else (a, a)
+
+
+@njit(
+    f"int64(int64[::1], int64, int64[::1], int32[:,::1], int64, {FOREST})",
+    cache=True,
+    nogil=True,
+)
+def make_wood(
+    path: Ints, of: int, pending: Ints, journal: Int32s, noted: int, forest: Forest
+) -> int:
+    """Make a path wood of a component, from which ways start; return the journal's new count."""
+    _, _, _, distance, previous, label, marks = forest
+    for i in range(len(path)):
+        w = path[i]
+        if distance[w] > 0:
+            noted = note(w, noted, journal, distance, previous, label, marks)
+            distance[w], previous[w], label[w] = 0, CENTRE, of
+            marks[w] |= 1
+            push(pending, w)
+    return noted
+
+
+@njit("int64[:,::1](int64[::1], int64[::1], int64[:,::1])", cache=True, nogil=True)
+def heap_of(edges: Ints, costs: Ints, ends: Ints) -> Ints:
+    """Return borders in canonical order as a heap, which they already are."""
+    heap = np.empty((2 * len(edges) + 64, 3), dtype=np.int64)
+    heap[0, 0] = len(edges)
+    for i in range(len(edges)):
+        heap[i + 1, 0], heap[i + 1, 1], heap[i + 1, 2] = costs[i], ends[i, 0], edges[i]
+    return heap
+
+
+@njit(
+    "Tuple((int64[::1], int64[::1], int64[::1], int64))"
+    f"(int64[::1], int64[::1], int64[:,::1], int32[::1], int64, {FOREST})",
     cache=True,
     nogil=True,
 )
 def join_all(
-    edges: Ints,
-    costs: Ints,
-    ends: Ints,
-    parent: Int32s,
-    joins: int,
-    levels: Bytes,
-    neighbours: Int32s,
-    places: Int32s,
-    distance: Int32s,
-    previous: Bytes,
-    label: Int32s,
-    marks: Bytes,
+    edges: Ints, costs: Ints, ends: Ints, parent: Int32s, joins: int, forest: Forest
 ) -> tuple[Ints, Ints, Ints, int]:
     """Join components by the cheapest way between any two, `joins` times; each way then is wood.
 
     What a new way changes is worked out only as far as it can matter yet: no border of cost T has
-    an end farther from wood than T / 2. All arrays are as before when this returns.
+    an end farther from wood than T / 2. All arrays are as before when this returns. Borders come in
+    canonical order.
 
     Returns the slots of all ways one after the other, where each starts, what it costs, and how
     many slots were worked on.
     """
-    borders = [(costs[i], ends[i, 0], edges[i] & 31, edges[i] >> 5) for i in range(len(edges))]
-    heapq.heapify(borders)
-    pending = [0]
-    pending.clear()
+    _, neighbours, _, distance, previous, label, marks = forest
+    borders, pending = heap_of(edges, costs, ends), np.zeros(1 << 12, dtype=np.int64)
     journal, noted, settled = np.empty((1 << 12, 4), dtype=np.int32), 0, 0
     slots, starts = np.empty(0, dtype=np.int64), np.empty(joins, dtype=np.int64)
     totals, done = np.empty(joins, dtype=np.int64), 0
-    while done < joins and (borders or pending):
-        if pending and (not borders or 2 * (pending[0] >> 32) <= borders[0][0]):
-            u = heapq.heappop(pending) & 0xFFFFFFFF
-            if marks[u] & 1 == 0:
-                continue
-            marks[u] ^= 1
-            settled += 1
-            if noted + 27 > len(journal):
-                journal = longer(journal, 2 * len(journal))
-            for k in range(27):
-                v = beside(neighbours, u, k)
-                if levels[v] == 0 or k == CENTRE:
-                    continue
-                step = int(COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k])
-                through, known = int(distance[u]) + step, int(distance[v])
-                better = through < known or (through == known and 26 - k < previous[v])
-                relabel = through == known and previous[v] == 26 - k
-                if better or relabel:
-                    again = through < known or label[v] != label[u]
-                    if better or again:
-                        noted = note(v, noted, journal, distance, previous, label, marks)
-                        distance[v], previous[v], label[v] = through, 26 - k, label[u]
-                    if again:
-                        marks[v] |= 1
-                        heapq.heappush(pending, through << 32 | v)
-                if distance[v] != UNREACHED and (
-                    root_of(parent, int(label[u])) != root_of(parent, int(label[v]))
-                ):
-                    total = int(distance[u]) + step + int(distance[v])
-                    lower, way = (u, k) if k > CENTRE else (v, 26 - k)
-                    heapq.heappush(borders, (total, key_of(places, lower), way, lower))
+    while done < joins and (borders[0, 0] or pending[0]):
+        if pending[0] and (not borders[0, 0] or 2 * (pending[1] >> 32) <= borders[1, 0]):
+            u = pending[1] & 0xFFFFFFFF
+            pop(pending)
+            if marks[u] & 1:
+                marks[u] ^= 1
+                settled += 1
+                journal, borders = longer(journal, noted + 27), with_room(borders, 27)
+                if pending[0] + 28 > len(pending):
+                    pending = resized_long(pending, 2 * len(pending))
+                noted = spread(u, pending, borders, journal, noted, parent, forest)
             continue
-        total, _, k, u = heapq.heappop(borders)
-        v = beside(neighbours, u, k)
-        a, b = root_of(parent, int(label[u])), root_of(parent, int(label[v]))
-        step = int(COSTS[int(levels[u]) + int(levels[v])] + LENGTHS[k])
-        if a == b or total != int(distance[u]) + step + int(distance[v]):
+        total, edge = borders[1, 0], borders[1, 2]
+        pop_row(borders)
+        a, b = joined_by(edge, total, parent, forest)
+        if a == b:
             continue
-        path = trace(u << 5 | k, neighbours, previous)
+        path = trace(edge, neighbours, previous)
         parent[max(a, b)] = min(a, b)
         starts[done], totals[done] = len(slots), total
-        done += 1
-        slots = resized_long(slots, len(slots) + len(path))
-        while noted + len(path) > len(journal):
-            journal = longer(journal, 2 * len(journal))
-        for i in range(len(path)):
-            w = path[i]
-            slots[len(slots) - len(path) + i] = w
-            if distance[w] > 0:
-                noted = note(w, noted, journal, distance, previous, label, marks)
-                distance[w], previous[w], label[w] = 0, CENTRE, min(a, b)
-                marks[w] |= 1
-                heapq.heappush(pending, w)
+        slots, done = joined(slots, path), done + 1
+        journal = longer(journal, noted + len(path))
+        if pending[0] + len(path) >= len(pending):
+            pending = resized_long(pending, 2 * (len(pending) + len(path)))
+        noted = make_wood(path, min(a, b), pending, journal, noted, forest)
     roll_back(journal, noted, distance, previous, label, marks)
     return slots, resized_long(starts, done), resized_long(totals, done), settled

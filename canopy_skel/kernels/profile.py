@@ -101,6 +101,48 @@ def principal_axis(u: Floats, v: Floats) -> tuple[float, float, float, float]:
 
 
 @njit(cache=True, nogil=True)
+def squares_off(x: Floats, y: Floats, values: Floats) -> float:
+    """Return the sum of squared deviations of points from a polyline."""
+    squares = 0.0
+    for i in range(len(x)):
+        left, b = hats(x[i], len(values))
+        squares += (y[i] - (1.0 - b) * values[left] - b * values[left + 1]) ** 2
+    return squares
+
+
+@njit(cache=True, nogil=True)
+def fit_disparity(x: Floats, d: Floats, count: int, steepest: float, tolerance_m: float) -> Floats:
+    """Return the robust profile (count,) of disparity d at x in [0, 1]: a line, then reweighted."""
+    at_0, slope = best_line(x, d, steepest, 60, tolerance_m)
+    line = np.zeros(count)
+    for k in range(count):
+        line[k] = max(at_0 + slope * k / (count - 1), 1e-3)
+    values = line.copy()
+    weight = np.zeros(len(x))
+    for _ in range(6):
+        for i in range(len(x)):
+            left, b = hats(x[i], count)
+            fit = (1.0 - b) * values[left] + b * values[left + 1]
+            r = abs(d[i] - fit) / (tolerance_m * max(fit, 0.8) ** 2)
+            weight[i] = (1.0 - r * r) ** 2 if r < 1.0 else 0.0
+        values = fit_hats(x, d, weight, count, 0.1, line, 0.01)
+    return values
+
+
+@njit(cache=True, nogil=True)
+def reached(x: Floats, d: Floats, values: Floats, tolerance_m: float) -> tuple[int, float, float]:
+    """Return how many points lie on a profile, and the first and last place of them."""
+    inliers, first, last = 0, 2.0, -1.0
+    for i in range(len(x)):
+        left, b = hats(x[i], len(values))
+        fit = (1.0 - b) * values[left] + b * values[left + 1]
+        if abs(d[i] - fit) <= tolerance_m * max(fit, 0.8) ** 2:
+            inliers += 1
+            first, last = min(first, x[i]), max(last, x[i])
+    return inliers, first, last
+
+
+@njit(cache=True, nogil=True)
 def fit_region(
     u: Floats,
     v: Floats,
@@ -126,39 +168,17 @@ def fit_region(
     count = min(max(int(span / knot_px + 0.5) + 1, 2), max_knots)
     x = (s - low) / span
     lateral = fit_hats(x, q, np.ones(n), count, 0.2, np.zeros(count), 0.002)
-    spread = 0.0
-    for i in range(n):
-        left, b = hats(x[i], count)
-        spread += (q[i] - (1.0 - b) * lateral[left] - b * lateral[left + 1]) ** 2
+    spread = squares_off(x, q, lateral)
     width = n / (span + 1.0)
-    good = np.isfinite(z)
-    valid = int(good.sum())
+    good, valid = np.isfinite(z), int(np.isfinite(z).sum())
     quality[0], quality[1], quality[2] = n, span + 1.0, width
     quality[3], quality[5] = valid / n, math.sqrt(spread / n) / width
     if valid < 3 or valid < min_valid * n:
         return 0, knots, quality
     xd, d = x[good], 1.0 / z[good]
     steepest = 4.0 * float(np.median(d)) / f_px * span
-    at_0, slope = best_line(xd, d, steepest, 60, tolerance_m)
-    line = np.zeros(count)
-    for k in range(count):
-        line[k] = max(at_0 + slope * k / (count - 1), 1e-3)
-    values = line.copy()
-    weight = np.zeros(valid)
-    for _ in range(6):
-        for i in range(valid):
-            left, b = hats(xd[i], count)
-            fit = (1.0 - b) * values[left] + b * values[left + 1]
-            r = abs(d[i] - fit) / (tolerance_m * max(fit, 0.8) ** 2)
-            weight[i] = (1.0 - r * r) ** 2 if r < 1.0 else 0.0
-        values = fit_hats(xd, d, weight, count, 0.1, line, 0.01)
-    inliers, first, last = 0, 2.0, -1.0
-    for i in range(valid):
-        left, b = hats(xd[i], count)
-        fit = (1.0 - b) * values[left] + b * values[left + 1]
-        if abs(d[i] - fit) <= tolerance_m * max(fit, 0.8) ** 2:
-            inliers += 1
-            first, last = min(first, xd[i]), max(last, xd[i])
+    values = fit_disparity(xd, d, count, steepest, tolerance_m)
+    inliers, first, last = reached(xd, d, values, tolerance_m)
     quality[4] = inliers / valid
     if inliers < 3 or values.min() <= 0.05:
         return 0, knots, quality

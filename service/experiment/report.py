@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from service.experiment.orchard import Orchard
 from service.experiment.published import FIGURES, published
-from service.experiment.rows import Row, code_sha256
+from service.experiment.rows import Row
 from service.experiment.segmenters import degradation
+from service.experiment.sources import sources_sha256
 from service.experiment.table import Mean, Rows
 
 HEADS = {"precision": "P", "recall": "R", "osr": "OSR"}
@@ -72,8 +73,11 @@ class Report:
             "",
             f"`{self.command}`",
             "",
-            f"{rows.trees} trees, {len(rows.rows)} rows; code {code_sha256()[:12]}; settings "
-            + ", ".join(f"`{name}` {config[:12]}" for name, config in configs.items())
+            f"{rows.trees} trees, {len(rows.rows)} rows; settings and code "
+            + ", ".join(
+                f"`{name}` {config[:12]} {sources_sha256(self.segmenters[0], name)[:12]}"
+                for name, config in configs.items()
+            )
             + ". Means over topologies ± standard error; every figure is explained in the page on"
             " metrics, and every row is in `rows.csv`. Simulated trees only.",
         ]

@@ -5,20 +5,14 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
-from hashlib import sha256
-from importlib.metadata import version
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from canopy_skel.errors import UsageError
 from service.experiment.orchard import Tree
+from service.experiment.sources import sources_sha256
 
 Value = float | int | bool | str | None
 _SHORT = 12
-_MEASURE = "experiment/measure.py"
-_UNCONCERNED = ("drivers/oak", "drivers/ur5")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,34 +58,9 @@ def key_of(tree: Tree, segmenter: str, method: str, config_sha256: str) -> str:
         segmenter,
         method,
         config_sha256[:_SHORT],
-        code_sha256()[:_SHORT],
+        sources_sha256(segmenter, method)[:_SHORT],
     )
     return "/".join(parts)
-
-
-@cache
-def code_sha256() -> str:
-    """Return the hash of the version and of all code that rows depend on."""
-    digest = sha256(version("canopy-skel").encode())
-    sources = [
-        source
-        for package in ("canopy_skel", "drivers")
-        for source in _sources(files(package), package)
-    ]
-    sources.append((_MEASURE, files("service").joinpath(_MEASURE).read_bytes()))
-    for path, data in sorted(sources):
-        if not path.startswith(_UNCONCERNED):
-            digest.update(path.encode() + b"\0" + data + b"\0")
-    return digest.hexdigest()
-
-
-def _sources(folder: Traversable, name: str) -> Iterator[tuple[str, bytes]]:
-    for entry in folder.iterdir():
-        path = f"{name}/{entry.name}"
-        if entry.is_dir():
-            yield from _sources(entry, path)
-        elif entry.name.endswith(".py"):
-            yield path, entry.read_bytes()
 
 
 class RowStore:

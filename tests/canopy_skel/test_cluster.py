@@ -1,18 +1,14 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import naive_cluster
 
-from canopy_skel.cluster import (
-    ClusterConfig,
-    cluster_branches,
-    connected_parts,
-    eroded,
-    principal_axes,
-)
+from canopy_skel.cluster import ClusterConfig, cluster_branches, principal_axes
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Intrinsics, View
 from canopy_skel.kernels.strip import measure
+from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
 LENS = Intrinsics(fx_px=400, fy_px=400, cx_px=160, cy_px=100, width_px=320, height_px=200)
@@ -173,24 +169,63 @@ def test_a_view_without_depth_says_what_to_do():
 
 
 def test_a_thin_mask_is_not_eroded_away():
-    thin = np.zeros((5, 40), bool)
-    thin[2] = True
-    np.testing.assert_array_equal(eroded(thin, 1, 0.3), thin)
-    thick = np.ones((12, 40), bool)
-    assert eroded(thick, 1, 0.3).sum() == 10 * 38
+    depth_m, instances = stick()
+    instances[:] = 0
+    instances[99:101, 60:260] = 1
+    (cluster,), _ = clusters_of(depth_m, instances)
+    assert len(cluster.points_in_base) == 2 * 200
+
+
+def test_a_mask_outside_the_picture_is_refused():
+    view = view_with(*stick())
+    masks = [
+        BranchMask(instance=7, left_px=300, top_px=5, mask=np.ones((4, 30), bool), confidence=0.5)
+    ]
+    with pytest.raises(ViewError, match=r"instance 7 covers columns 300 to 330"):
+        cluster_branches(view, masks, CONFIG)
+
+
+def test_no_masks_give_no_clusters():
+    assert clusters_of(stick()[0], np.zeros((200, 320)), scores=()) == ([], [])
+
+
+def cluttered(seed):
+    """A few branches, bent and across one another, with noise, leaves, holes and a blob."""
+    random = np.random.default_rng(seed)
+    depth_m, instances = np.full((200, 320), 2.5), np.zeros((200, 320))
+    rows, columns = np.mgrid[:200, :320]
+    count = int(random.integers(1, 7))
+    for number in range(1, count + 1):
+        middle, angle = random.uniform((40, 40), (160, 280)), random.uniform(0, np.pi)
+        along = (columns - middle[1]) * np.cos(angle) + (rows - middle[0]) * np.sin(angle)
+        across = (rows - middle[0]) * np.cos(angle) - (columns - middle[1]) * np.sin(angle)
+        half = random.uniform((1, 8), (9, 120))
+        inside = (np.abs(across) < half[0]) & (np.abs(along) < half[1])
+        instances[inside] = number
+        slope, at_m = random.uniform(-2e-3, 2e-3), random.uniform(0.5, 1.6)
+        depth_m[inside] = (at_m + slope * along + random.normal(0, 0.002, along.shape))[inside]
+    for _ in range(int(random.integers(0, 20))):
+        v, u = random.integers(0, 180), random.integers(0, 290)
+        leaf = random.choice([np.nan, random.uniform(0.2, 6.0)])
+        depth_m[v : v + random.integers(3, 20), u : u + random.integers(3, 30)] = leaf
+    return depth_m, instances, tuple(random.uniform(0.3, 1.0, count))
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_parts_partition_the_points_and_lie_apart(seed):
-    random = np.random.default_rng(seed)
-    points = random.uniform(0, 0.3, (random.integers(1, 60), 3))
-    parts = connected_parts(points, 0.03)
-    assert sorted(np.concatenate(parts).tolist()) == list(range(len(points)))
-    assert [len(p) for p in parts] == sorted((len(p) for p in parts), reverse=True)
-    for i, one in enumerate(parts):
-        for other in parts[i + 1 :]:
-            gaps = np.linalg.norm(points[one][:, None] - points[other][None], axis=2)
-            assert gaps.min() > 0.03 * 0.999
+@settings(max_examples=60)
+def test_all_masks_at_once_are_one_mask_after_the_other(seed):
+    depth_m, instances, scores = cluttered(seed)
+    view = view_with(depth_m, instances, scores)
+    masks = RecordedSegmenter().segment(view)
+    clusters, rejected = cluster_branches(view, masks, CONFIG)
+    for mask in masks:
+        expected, reasons = naive_cluster.clusters_of_mask(view, mask, CONFIG)
+        mine = [c for c in clusters if c.instance == mask.instance]
+        assert [len(c.points_in_base) for c in mine] == [len(points) for points, _ in expected]
+        for cluster, (points, width_m) in zip(mine, expected, strict=True):
+            np.testing.assert_allclose(cluster.points_in_base, points, rtol=1e-12)
+            assert cluster.half_width_m == pytest.approx(width_m, rel=1e-12)
+        assert [r.reason for r in rejected if r.instance == mask.instance] == reasons
 
 
 @given(st.integers(0, 2**32 - 1))

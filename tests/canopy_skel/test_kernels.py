@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
-from oracles import naive_likelihood, naive_pathsearch
+from oracles import naive_cluster, naive_likelihood, naive_pathsearch
 from scipy.interpolate import make_lsq_spline
 
-from canopy_skel.cluster import BranchCluster, principal_axes
+from canopy_skel.cluster import BranchCluster, ClusterConfig, cluster_branches, principal_axes
+from canopy_skel.frame import Intrinsics, View
 from canopy_skel.initial import InitialConfig, initial_skeleton
-from canopy_skel.kernels.ellipsoid import UNITS_PER_NAT
+from canopy_skel.kernels.sums import UNITS_PER_NAT
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments
 from canopy_skel.pathsearch import PathSearch
+from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.spline import SplineConfig, fit_splines
 from canopy_skel.strands import StrandMap
 
@@ -103,6 +105,33 @@ def test_repaired_searches_are_searches_from_scratch_and_literal():
         paths = [[tuple(v) for v in join.voxels.tolist()] for join in scene.search.joins()]
         assert paths == literal(scene, graph)
     assert len(paths) == 2
+
+
+def test_clusters_are_those_of_one_mask_after_the_other():
+    depth_m, instances = np.full((30, 60), 1.5, np.float32), np.zeros((30, 60), np.uint16)
+    depth_m += np.random.default_rng(0).normal(0, 0.003, depth_m.shape).astype(np.float32)
+    instances[4:9, 2:50], instances[14:16, 5:40], instances[18:28, 20:31] = 1, 2, 3
+    depth_m[4:9, 20:26], depth_m[14:16, 8:10] = 0.9, np.nan
+    lens = Intrinsics(fx_px=80, fy_px=80, cx_px=30, cy_px=15, width_px=60, height_px=30)
+    view = View(
+        index=0,
+        stamp_ns=0,
+        color_rgb=np.zeros((30, 60, 3), np.uint8),
+        intrinsics=lens,
+        base_from_camera=np.eye(4),
+        depth_m=depth_m,
+        instances=instances,
+        scores=(0.9, 0.8, 0.7),
+    )
+    masks, config = RecordedSegmenter().segment(view), ClusterConfig()
+    clusters, rejected = cluster_branches(view, masks, config)
+    expected = [naive_cluster.clusters_of_mask(view, mask, config) for mask in masks]
+    np.testing.assert_allclose(
+        np.concatenate([cluster.points_in_base for cluster in clusters]),
+        np.concatenate([points for found, _ in expected for points, _ in found]),
+    )
+    assert [one.reason for one in rejected] == [r for _, reasons in expected for r in reasons]
+    assert [one.reason for one in rejected] == ["part too small", "not slender"]
 
 
 @pytest.mark.parametrize("shape", ["bowed", "line", "twice the same points", "two clumps"])

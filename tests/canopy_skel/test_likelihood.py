@@ -53,6 +53,33 @@ def test_map_is_the_papers_formula(rows):
     np.testing.assert_allclose(dense, expected, atol=2e-5 * len(rows))
 
 
+direction = st.one_of(
+    st.sampled_from([(1.0, 0, 0), (0, -1.0, 0), (0, 0, 1.0), (1e-13, 0, 1.0), (1e-9, 1e-9, -1.0)]),
+    st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda d: np.linalg.norm(d) > 0.1),
+)
+
+
+@given(point, direction, st.floats(0.3, 6), st.floats(1e-3, 3), st.floats(0.01, 1.0))
+def test_every_voxel_gets_the_formula_to_a_unit(start, way, length, radius, confidence):
+    """Single precision is enough, and no voxel of the support is left out."""
+    start, axis = np.array(start), np.array(way) / np.linalg.norm(way)
+    grid = grid_of([(start, start + axis * length * VOXEL, radius * VOXEL, confidence)])
+    low, high = grid.voxels.min(axis=0) - 1, grid.voxels.max(axis=0) + 2
+    voxels = np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1)
+    offset = voxels + 0.5 - start / VOXEL
+    along = offset @ axis
+    beyond = np.maximum(0, np.maximum(-along, along - length)) / length
+    across = np.linalg.norm(offset - along[..., None] * axis, axis=-1) / radius
+    c = min(confidence, 0.999)
+    p = np.maximum(0, c - c / 3 * np.hypot(beyond, across))
+    units = np.zeros(p.shape)
+    units[tuple((grid.voxels - low).T)] = grid.units
+    off = np.abs(units + np.log1p(-p) * 65536)
+    full = np.abs(units + np.log1p(-c) * 65536) <= 1  # or the segment passes here (rule 1)
+    assert (off[~full] <= 1).all()
+    assert full.sum() - (off <= 1)[full].sum() <= 2 + 2 * length
+
+
 def test_support_ends_where_the_formula_does():
     grid = grid_of([((0.0, 0.0, 0.0), (0.05, 0.0, 0.0), 0.01, 0.6)])
     centres = grid.centres_in_base()
