@@ -88,8 +88,8 @@ segmentation, on a busy machine. The number behind a recording is the share of i
 mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated
 ones; fragments are found by colour, and simulated colours are not an orchard's: the rows "masks
 only" do not depend on them. Rows with *worse masks* (a quarter dropped, a fifth false) and with the
-masks of the built-in *unet* show what a real detector would leave of it; they use the confidences for
-learned masks. Depth counts up to 3 m, so trees of the next row do not.
+masks of the built-in *unet* show what a real detector would leave of it; they use the confidences
+for learned masks. Depth counts up to 3 m, so trees of the next row do not.
 
 ![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
 
