@@ -15,6 +15,7 @@ setup: $(READY)
 $(RUNS): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/python -m service.kernels
 	touch $@
 
 $(READY): $(RUNS) tests/gltf_validator/package-lock.json

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from canopy_skel.geometry import FloatArray
 
 MODELS_FILE = "canopy-confidence.json"
+Masks = Literal["recorded", "learned"]
+"""Where masks come from: recorded beside the pictures and hardly ever wrong, or from a network."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -75,8 +77,12 @@ class Models:
     provenance: str
 
 
-def models_from(value: Mapping[str, Any]) -> Models:
+def models_from(value: Mapping[str, Any]) -> dict[Masks, Models]:
     """Return the models that `models_to` wrote."""
+    return {masks: _one_from(value[masks]) for masks in get_args(Masks)}
+
+
+def _one_from(value: Mapping[str, Any]) -> Models:
     return Models(
         provenance=value["provenance"],
         **{
@@ -92,14 +98,16 @@ def models_from(value: Mapping[str, Any]) -> Models:
     )
 
 
-def models_to(models: Models) -> bytes:
-    """Return the models as JSON, one line per model."""
-    fields = asdict(models)
-    lines = (f"{json.dumps(name)}: {json.dumps(value)}" for name, value in fields.items())
-    return ("{" + ",\n ".join(lines) + "}\n").encode()
+def models_to(models: Mapping[Masks, Models]) -> bytes:
+    """Return the models for each kind of masks as JSON, one line per model."""
+    sets = []
+    for masks, one in models.items():
+        lines = (f"{json.dumps(name)}: {json.dumps(value)}" for name, value in asdict(one).items())
+        sets.append(f"{json.dumps(masks)}: {{\n " + ",\n ".join(lines) + "}")
+    return ("{" + ",\n".join(sets) + "}\n").encode()
 
 
 @cache
-def shipped_models() -> Models:
-    """Return the models this package ships."""
+def shipped_models() -> dict[Masks, Models]:
+    """Return the models this package ships, by where masks come from."""
     return models_from(json.loads((files("canopy_skel") / "models" / MODELS_FILE).read_text()))

@@ -38,10 +38,10 @@ class Observation:
     """What one view shows.
 
     splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
-    instances without enough depth. points_in_base,
-    directions: (N, 3), along the pieces; piece: (N,), which of them, ascending; radius_m, fragment:
-    (N,); quality: (N, 8), score, quality of the piece, log of half its area over its length. evidence: the view, ready to be asked.
-    cells: (N,) cell numbers ascending, of the points in the order `by_cell` (N,).
+    instances without enough depth. points_in_base, directions: (N, 3), along the pieces; piece:
+    (N,), which of them, ascending; radius_m, fragment: (N,); quality: (N, 8), score, quality of the
+    piece, log of half its area over its length. evidence: the view, ready to be asked. cells: (N,)
+    cell numbers ascending, of the points in the order `by_cell` (N,).
     """
 
     splines: list[BranchSpline]

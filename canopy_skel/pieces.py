@@ -23,11 +23,11 @@ class PieceConfig:
     """How a region becomes a polyline.
 
     A knot every `knot_px` along it, at most 8 for an instance and `fragment_knots` for a fragment.
-    Depth counts within [nearest_m, farthest_m] (behind that are other rows) and `tolerance_m` of the profile (growing with the
-    square of the distance beyond 1.25 m); a region with depth on less than `min_valid_share` of
-    its pixels is dropped, and so is an instance thicker than `thickest_m` in radius, a fragment
-    thicker than `thickest_fragment_m`: no branch. centre_shift: by how many radii the visible
-    surface is moved away from the camera.
+    Depth counts within [nearest_m, farthest_m] (behind that are other rows) and `tolerance_m` of
+    the profile (growing with the square of the distance beyond 1.25 m); a region with depth on less
+    than `min_valid_share` of its pixels is dropped, and so is an instance thicker than `thickest_m`
+    in radius, a fragment thicker than `thickest_fragment_m`: no branch. centre_shift: by how many
+    radii the visible surface is moved away from the camera.
     """
 
     knot_px: float = 12.0

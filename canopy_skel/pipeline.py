@@ -14,7 +14,7 @@ from canopy_skel.baselines.ftsem import FtsemConfig, join_break_points
 from canopy_skel.baselines.mst import join_by_spanning_tree
 from canopy_skel.canopy import CanopyConfig, CanopyScan
 from canopy_skel.cluster import ClusterConfig, RejectedInstance, cluster_branches
-from canopy_skel.confidence import shipped_models
+from canopy_skel.confidence import Models, shipped_models
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
@@ -24,6 +24,7 @@ from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.poses import PoseCorrection
 from canopy_skel.segment import BranchMask, Segmenter
+from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_splines
 from canopy_skel.strands import StrandMap
 from canopy_skel.wood import wood_of
@@ -97,6 +98,14 @@ class _Known:
     rejected: list[RejectedInstance]
 
 
+def models_for(segmenter: Segmenter) -> Models:
+    """Return the shipped confidences of method `canopy` that suit a segmenter's masks.
+
+    Recorded masks are believed more than those of any network.
+    """
+    return shipped_models()["recorded" if isinstance(segmenter, RecordedSegmenter) else "learned"]
+
+
 class Skeletonizer:
     """Takes views in any order and gives the skeleton of all views so far."""
 
@@ -107,12 +116,18 @@ class Skeletonizer:
         *,
         stage: Stage = lambda name: nullcontext(),
         memory_limit_bytes: int = 3 << 30,
+        models: Models | None = None,
     ) -> None:
-        """`stage(name)` is entered around each stage, for whoever wants to time it."""
+        """Start without views.
+
+        `stage(name)` is entered around each stage, for whoever wants to time it. `models` of method
+        `canopy`: without, `models_for` the segmenter.
+        """
         self._segmenter = segmenter
         self._config = config
         self._stage = stage
         self._memory_limit_bytes = memory_limit_bytes
+        self._models = models or models_for(segmenter)
         self._known: dict[int, _Known] = {}
         self._canopy = CanopyScan(config.canopy)
         self._start()
@@ -316,7 +331,7 @@ class Skeletonizer:
         )
 
     def _canopy_skeleton(self) -> Extraction:
-        joined = skeleton_of(self._canopy, self._map, shipped_models())
+        joined = skeleton_of(self._canopy, self._map, self._models)
         return Extraction(
             graph=joined.graph,
             voxels=self._map.occupied(),

@@ -1,35 +1,36 @@
 """Recordings with truth, made ready to fit confidences to."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from canopy_skel.canopy import CanopyConfig, CanopyScan
+from canopy_skel.confidence import Masks, Models
 from canopy_skel.document import from_json
-from canopy_skel.errors import RecordingError, UsageError
-from canopy_skel.fitting import Lesson, truth_points
+from canopy_skel.errors import RecordingError
+from canopy_skel.fitting import Lesson, fit_models, truth_points
 from canopy_skel.frame import View
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
+from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
 from canopy_skel.wood import wood_of
 from drivers.stereo import with_depth
-from service.skeletons import SEGMENTERS
+from service.experiment.segmenters import segmenter_named
 
 
-def lesson_from(path: Path, segmenter: str) -> Lesson:
+def lesson_from(path: Path, segmenter: str, *, use_fragments: bool = True) -> Lesson:
     """Read a recording and take all its views in.
 
     Raises:
         RecordingError: it cannot be read, or has no truth.
         UsageError: there is no such segmenter.
     """
-    if segmenter not in SEGMENTERS:
-        known = ", ".join(SEGMENTERS)
-        raise UsageError(f"unknown segmenter {segmenter!r}: choose one of {known}")
+    finder = segmenter_named(segmenter)
     recording = read_recording(path)
     if recording.ground_truth is None:
         raise RecordingError(
             f"{path}: no true skeleton is attached; record it with canopy simulate"
         )
-    finder, scan = SEGMENTERS[segmenter](), CanopyScan(CanopyConfig())
+    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments))
     likelihood = LikelihoodMap(LikelihoodConfig())
     for view in recording.views():
         if isinstance(view, View):
@@ -39,3 +40,28 @@ def lesson_from(path: Path, segmenter: str) -> Lesson:
             scan.add(view.index, seen)
     truth = truth_points(from_json(recording.ground_truth, str(path)))
     return Lesson(scan=scan, likelihood=likelihood, truth=truth)
+
+
+def lessons_from(path: Path, masks: Sequence[str]) -> list[Lesson]:
+    """Read a recording with each kind of masks, and with the first once more without fragments.
+
+    Raises: as `lesson_from`.
+    """
+    without = lesson_from(path, masks[0], use_fragments=False)
+    return [without, *(lesson_from(path, name) for name in masks)]
+
+
+def fitted(
+    lessons: Sequence[Sequence[Lesson]], names: Sequence[str], masks: Sequence[str]
+) -> dict[Masks, Models]:
+    """Fit to the `lessons_from` each scan; the first kind of masks are the recorded ones."""
+    settings = MethodConfig(name="canopy").sha256()[:12]
+
+    def fit(kinds: Sequence[str]) -> Models:
+        return fit_models(
+            [lesson for scan in lessons for lesson in scan[: len(kinds) + 1]],
+            f"fitted to {len(names)} scans (masks {', '.join(kinds)}; settings {settings}):"
+            f" {', '.join(names)}",
+        )
+
+    return {"recorded": fit(masks[:1]), "learned": fit(masks)}

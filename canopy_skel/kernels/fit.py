@@ -23,7 +23,8 @@ def diagonalise(matrix: Floats, vectors: Floats) -> None:
     for _ in range(SWEEPS):
         for p in range(2):
             for q in range(p + 1, 3):
-                if abs(matrix[p, q]) <= 1e-18 * (matrix[p, p] + matrix[q, q]):
+                # Sizes: rounding leaves zeros of a flat or straight matrix slightly negative.
+                if abs(matrix[p, q]) <= 1e-18 * (abs(matrix[p, p]) + abs(matrix[q, q])):
                     continue
                 theta = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
                 sign = 1.0 if theta >= 0.0 else -1.0

@@ -8,6 +8,9 @@ import typer
 from canopy_skel.errors import UsageError
 from service.cli.shell import progress_bars, stderr
 
+WORSE_MASKS = ("drop25+false20", "unet")
+"""What the shipped confidences of learned masks are fitted to, beside recorded ones."""
+
 
 def fit_confidence(
     recordings: Annotated[
@@ -18,32 +21,40 @@ def fit_confidence(
         list[Path] | None,
         typer.Option(help="Recordings to test on, not fitted; repeatable."),
     ] = None,
-    segmenter: Annotated[str, typer.Option(help="Where branch masks come from.")] = "recorded",
+    segmenter: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Masks that learned ones may be like; repeatable."
+            f" Without: {', '.join(WORSE_MASKS)}, as shipped."
+        ),
+    ] = None,
 ) -> None:
-    """Refit the confidences of method canopy to scans whose truth is known."""
+    """Refit the confidences of method canopy to scans whose truth is known.
+
+    Those for recorded masks are fitted to recorded masks, with and without fragments; those for
+    learned masks to these and the ones of all other segmenters.
+    """
     # Imported here: only this command fits.
     from canopy_skel.confidence import models_to
-    from canopy_skel.fitting import fit_models, reliability
-    from canopy_skel.pipeline import MethodConfig
-    from service.lessons import lesson_from
+    from canopy_skel.fitting import reliability
+    from service.lessons import fitted, lesson_from, lessons_from
 
     if output.is_dir():
         raise UsageError(f"{output} is a folder; name the JSON file to write")
+    masks = ("recorded", *(segmenter or WORSE_MASKS))
     lessons = []
     with progress_bars() as progress:
         task = progress.add_task("scans", total=len(recordings))
-        for path in recordings:
-            lessons.append(lesson_from(path, segmenter))
+        for path in sorted(recordings):
+            lessons.append(lessons_from(path, masks))
             progress.advance(task)
-    names = ", ".join(sorted(path.stem for path in recordings))
-    settings = MethodConfig(name="canopy").sha256()[:12]
-    models = fit_models(
-        lessons,
-        f"fitted to {len(lessons)} scans ({segmenter} masks, settings {settings}): {names}",
-    )
+    models = fitted(lessons, [path.stem for path in sorted(recordings)], masks)
     output.write_bytes(models_to(models))
-    stderr.print(f"{output}: {models.provenance}", markup=False)
+    for kind, one in models.items():
+        stderr.print(f"{output}, {kind}: {one.provenance}", markup=False)
     for path in held_out or []:
-        row = reliability(lesson_from(path, segmenter), models)
-        figures = " ".join(f"{name} {value:.3f}" for name, value in row.items())
-        typer.echo(f"{path.stem}: {figures}")
+        for name in masks:
+            chosen = models["recorded" if name == "recorded" else "learned"]
+            row = reliability(lesson_from(path, name), chosen)
+            figures = " ".join(f"{model} {value:.3f}" for model, value in row.items())
+            typer.echo(f"{path.stem}, {name}: {figures}")

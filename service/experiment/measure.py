@@ -13,7 +13,14 @@ from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.metrics import score
 from canopy_skel.metrics.matching import nearest
-from canopy_skel.pipeline import JOINERS, Extraction, MethodConfig, MethodName, Skeletonizer
+from canopy_skel.pipeline import (
+    JOINERS,
+    Extraction,
+    MethodConfig,
+    MethodName,
+    Skeletonizer,
+    models_for,
+)
 from canopy_skel.recording import Recording, read_recording
 from canopy_skel.segment import BranchMask, Segmenter
 from canopy_skel.volume import wood_volume_m3
@@ -131,7 +138,9 @@ def outcomes_of(
     masks = _Once(segmenter)
     for names in _alike(methods):
         front = MethodConfig(name="paper" if len(names) > 1 else names[0])
-        skeletonizer = Skeletonizer(masks, front, memory_limit_bytes=memory_limit_bytes)
+        skeletonizer = Skeletonizer(
+            masks, front, memory_limit_bytes=memory_limit_bytes, models=models_for(segmenter)
+        )
         _add_all(skeletonizer, views)
         used = len(skeletonizer.views)
         for name in names:

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scenes.leaves import GAP, leafy_view
 from scenes.wood import WOOD, view_from
 
-from canopy_skel.canopy import CanopyConfig, CanopyScan, canopy_config_from
+from canopy_skel.canopy import CanopyConfig, CanopyScan, canopy_config_from, piece_means
 from canopy_skel.confidence import (
     Logistic,
     fit_logistic,
@@ -26,7 +26,7 @@ from canopy_skel.geometry import transform_points
 from canopy_skel.links import Candidates, accepted
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
-from canopy_skel.pipeline import MethodConfig, Skeletonizer
+from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.wood import FragmentConfig, WoodDetector, colour_wood_probability, fragments_of
 
@@ -359,4 +359,24 @@ def test_a_row_has_the_same_probability_alone_and_among_others():
 def test_models_survive_being_written():
     models = shipped_models()
     assert models_from(json.loads(models_to(models))) == models
-    assert models.provenance
+    assert all(one.provenance for one in models.values())
+
+
+def test_masks_of_a_network_are_believed_less_than_recorded_ones(views):
+    class Network:
+        def segment(self, view):
+            return RecordedSegmenter().segment(view)
+
+    assert models_for(RecordedSegmenter()) == shipped_models()["recorded"]
+    assert models_for(Network()) == shipped_models()["learned"]
+    config = MethodConfig(name="canopy")
+    trusting, wary = Skeletonizer(RecordedSegmenter(), config), Skeletonizer(Network(), config)
+    for view in views:
+        trusting.add_view(view)
+        wary.add_view(view)
+    assert wary.skeleton().graph.confidence.mean() < trusting.skeleton().graph.confidence.mean()
+
+
+def test_a_false_mask_is_false_as_a_whole():
+    means = piece_means(np.array([[0.0, 1.0], [2.0, 1.0], [7.0, 3.0]]), np.array([0, 0, 1]))
+    assert means.tolist() == [[1.0, 1.0], [1.0, 1.0], [7.0, 3.0]]

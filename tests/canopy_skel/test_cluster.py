@@ -7,6 +7,7 @@ from oracles import naive_cluster
 from canopy_skel.cluster import ClusterConfig, cluster_branches, principal_axes
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Intrinsics, View
+from canopy_skel.kernels.parts import shapes_of
 from canopy_skel.kernels.strip import measure
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
@@ -237,3 +238,14 @@ def test_axes_do_not_depend_on_the_order_of_points(seed):
     np.testing.assert_allclose(axes, again, atol=1e-9)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
     assert (np.diff(deviation) <= 0).all()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 6))
+def test_a_straight_row_of_points_is_no_blob_and_one_spot_is(seed, count):
+    rng = np.random.default_rng(seed)
+    row = rng.normal(0.0, 0.3, 3) + np.outer(np.arange(count), rng.normal(0.0, 0.01, 3))
+    spot = np.repeat(row[:1], count, axis=0)
+    shapes = shapes_of(np.concatenate([row, spot]), np.array([0, count, 2 * count]))
+    assert shapes[0, 0] < 1e-3
+    assert shapes[1, 0] == 1.0
+    np.testing.assert_allclose(shapes[:, 1], [np.median(row[:, 2]), row[0, 2]])

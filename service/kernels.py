@@ -1,0 +1,52 @@
+"""The compiled kernels, made on all cores the first time.
+
+Numba compiles a module as it is imported, on one core, and keeps the result on disk. Here every
+module is imported in some process of its own first, so that a first start waits half as long on
+two cores. Run as `python -m service.kernels` after installing.
+"""
+
+import importlib
+import multiprocessing
+import os
+import pkgutil
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+PACKAGE = "canopy_skel.kernels"
+
+
+def compile_kernels() -> None:
+    """Have all kernels on disk; returns at once where any is there already.
+
+    What is missing or out of date then is compiled on import, as ever.
+    """
+    if _any_on_disk():
+        return
+    print("compiling the kernels, once", file=sys.stderr)  # noqa: T201 - before any other output
+    spawn = multiprocessing.get_context("spawn")
+    with spawn.Pool(min(os.cpu_count() or 1, 8)) as pool:
+        pool.map(_import, modules(), chunksize=1)
+
+
+def modules() -> list[str]:
+    """Return the names of all modules of kernels, the largest first: they take longest."""
+    folder = Path(str(files(PACKAGE)))
+    found = [info.name for info in pkgutil.iter_modules([str(folder)])]
+    found.sort(key=lambda name: -(folder / f"{name}.py").stat().st_size)
+    return [f"{PACKAGE}.{name}" for name in found]
+
+
+def _import(module: str) -> None:
+    importlib.import_module(module)
+
+
+def _any_on_disk() -> bool:
+    """Whether numba has put anything where it puts these kernels."""
+    elsewhere = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(elsewhere) if elsewhere else Path(str(files(PACKAGE))) / "__pycache__"
+    return any(folder.rglob("*.nbi"))
+
+
+if __name__ == "__main__":
+    compile_kernels()
