@@ -1,9 +1,10 @@
 """Training images for a branch segmenter, as a COCO data set.
 
 The pictures are those the built-in weights are trained on (`composed`), of a seed of your own.
-Every fragment a network should find is an annotation with polygons; wood too small for that is one
-`iscrowd` region per image, to be ignored. Each image has a label file of its own, so
-that the work can be stopped and gone on with; `annotations.json` is put together at the end.
+Every fragment a network should find is an annotation with polygons and a score, how sure a good
+detector would be of it; wood too small for that is one `iscrowd` region per image, to be ignored.
+Each image has a label file of its own, so that the work can be stopped and gone on with;
+`annotations.json` is put together at the end.
 """
 
 import json
@@ -15,12 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.segmenters.labels import LabelledImage
 from mock_hw.orchard.camera import Camera, scaled
 from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
 from mock_hw.orchard.files import write_whole
+from mock_hw.orchard.instances import clarity
 from mock_hw.orchard.outlines import box, polygons, run_lengths
 from mock_hw.orchard.presets import species_named
 from mock_hw.orchard.workers import alone_in, require_jobs, workers
@@ -153,14 +156,16 @@ def label_of(frame: LabelledImage, index: int) -> dict[str, Any]:
 
 
 def _annotations(frame: LabelledImage, index: int) -> Iterator[dict[str, Any]]:
-    for number in range(1, len(frame.lines) + 1):
+    for number, line in enumerate(frame.lines, start=1):
         mask = frame.instances == number
+        pixels, width_px = int(mask.sum()), 2.0 * float(np.median(line[:, 2]))
         yield {
             "image_id": index,
             "category_id": BRANCH,
             "segmentation": polygons(mask),
-            "area": int(mask.sum()),
+            "area": pixels,
             "bbox": box(mask),
+            "score": round(float(np.clip(clarity(pixels, width_px), 0.5, 0.99)), 3),
             "iscrowd": 0,
         }
     if frame.ignore.any():

@@ -7,6 +7,7 @@ pixels, is a fragment. Fragments large enough for a network to find are instance
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from canopy_skel.frame import Intrinsics, UInt16Array
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, invert, transform_points
@@ -131,8 +132,13 @@ def instances_of(
     chosen = np.flatnonzero(fragments.detectable)
     number = np.zeros(len(fragments.pixels) + 1, dtype=np.uint16)
     number[chosen] = np.arange(1, len(chosen) + 1)
-    size = np.log(fragments.pixels[chosen] / LEAST_PIXELS)
-    width = np.log(fragments.width_px[chosen] / LEAST_WIDTH_PX)
-    clear = 0.62 + 0.065 * size + 0.06 * width
+    clear = clarity(fragments.pixels[chosen], fragments.width_px[chosen])
     scores = np.clip(clear + rng.normal(0, 0.06, len(chosen)), 0.5, 0.99)
     return number[fragments.label], tuple(round(float(score), 3) for score in scores)
+
+
+def clarity(pixels: ArrayLike, width_px: ArrayLike) -> FloatArray:
+    """Return how sure a good detector would be of fragments of this many pixels and mean width."""
+    size = np.log(np.asarray(pixels) / LEAST_PIXELS)
+    width = np.log(np.asarray(width_px) / LEAST_WIDTH_PX)
+    return np.asarray(0.62 + 0.065 * size + 0.06 * width)

@@ -52,6 +52,8 @@ def test_a_coco_reader_finds_every_instance_to_the_pixel(coco, frames):
     for index, frame in enumerate(frames):
         pieces = coco.loadAnns(coco.getAnnIds(index, iscrowd=False))
         assert len(pieces) == len(frame.lines)
+        by_size = sorted(pieces, key=lambda piece: piece["area"])
+        assert 0.5 <= by_size[0]["score"] < by_size[-1]["score"] <= 0.99
         for number, piece in enumerate(pieces, start=1):
             mask = frame.instances == number
             found = coco.annToMask(piece).astype(bool)
