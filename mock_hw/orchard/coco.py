@@ -158,14 +158,15 @@ def label_of(frame: LabelledImage, index: int) -> dict[str, Any]:
 def _annotations(frame: LabelledImage, index: int) -> Iterator[dict[str, Any]]:
     for number, line in enumerate(frame.lines, start=1):
         mask = frame.instances == number
-        pixels, width_px = int(mask.sum()), 2.0 * float(np.median(line[:, 2]))
+        pixels = int(mask.sum())
+        length_px = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
         yield {
             "image_id": index,
             "category_id": BRANCH,
             "segmentation": polygons(mask),
             "area": pixels,
             "bbox": box(mask),
-            "score": round(float(np.clip(clarity(pixels, width_px), 0.5, 0.99)), 3),
+            "score": round(float(np.clip(clarity(pixels, pixels / length_px), 0.5, 0.99)), 3),
             "iscrowd": 0,
         }
     if frame.ignore.any():
