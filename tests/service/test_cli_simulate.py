@@ -164,7 +164,7 @@ def test_coco_writes_a_data_set_and_says_where(canopy, tmp_path):
     assert code == 0
     result = json.loads(out)
     document = json.loads(Path(result["annotations"]).read_text())
-    assert [image["species"] for image in document["images"]] == ["walnut"]
+    assert document["info"]["species"] == ["walnut"]
     assert os.listdir(tmp_path / "images") == ["000000.jpg"]
 
 

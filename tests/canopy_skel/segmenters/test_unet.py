@@ -164,7 +164,7 @@ def test_pictures_that_are_not_8_bit_colour_are_refused(untrained, color):
 
 def test_instances_below_the_least_score_are_not_reported(untrained):
     view = view_of(noise(200, 300))
-    loose = replace(untrained, grouping=Grouping(least_pixels=8, least_length_px=2))
+    loose = replace(untrained, grouping=Grouping(outline=0.4, least_pixels=8, least_length_px=2))
     assert len(UNetSegmenter(loose).segment(view)) > 0
     assert UNetSegmenter(replace(loose, least_score=0.6)).segment(view) == []
 
