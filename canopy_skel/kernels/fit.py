@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 SWEEPS = 12
+SINGULAR = 1e-6
+"""Share of a diagonal entry that elimination must leave; rounding leaves some 1e-16 of it."""
 
 
 @njit("void(float64[:,::1], float64[:,::1])", cache=True, nogil=True)
@@ -120,12 +122,18 @@ def normal_equations(
             right[i + 1, j] += b * points[n, j]
 
 
-@njit("void(float64[:,::1], float64[:,::1], int64)", cache=True, nogil=True)
-def solve(matrix: Floats, right: Floats, count: int) -> None:
-    """Solve the tridiagonal system in place (Cholesky without roots: it is positive definite)."""
+@njit("boolean(float64[:,::1], float64[:,::1], int64)", cache=True, nogil=True)
+def solve(matrix: Floats, right: Floats, count: int) -> bool:
+    """Solve the tridiagonal system in place (Cholesky without roots), if it is positive definite.
+
+    It is not where the points near two knots all have one place between them.
+    """
     for i in range(1, count):
         factor = matrix[i - 1, 1] / matrix[i - 1, 0]
+        least = SINGULAR * matrix[i, 0]
         matrix[i, 0] -= factor * matrix[i - 1, 1]
+        if matrix[i, 0] <= least:
+            return False
         for j in range(3):
             right[i, j] -= factor * right[i - 1, j]
     for back in range(count):
@@ -134,6 +142,7 @@ def solve(matrix: Floats, right: Floats, count: int) -> None:
             if back > 0:
                 right[i, j] -= matrix[i, 1] * right[i + 1, j]
             right[i, j] /= matrix[i, 0]
+    return True
 
 
 @njit(
@@ -155,7 +164,8 @@ def fit_splines(
     """Fit a spline of up to `most` control points, uniform knots along PC1, to every cluster.
 
     Writes the control points (C, most, 3), principal axes (C, 3, 3), means (C, 3) and the numbers
-    of control points: fewer where some would have points of less than `min_weight`.
+    of control points: fewer where some would have points of less than `min_weight`, or points would
+    not tell them apart.
     """
     longest = 0
     for c in range(len(start) - 1):
@@ -174,18 +184,18 @@ def fit_splines(
         scale = 1.0 / max(high - low, 1e-12)
         for n in range(end - first):
             along[n] = min((along[n] - low) * scale, 1.0)
-        count, enough = most, False
-        while not enough:
+        count, solved = most + 1, False
+        while not solved and count > 2:
+            count -= 1
             normal_equations(points, first, end, along, count, matrix, weight, controls[c])
-            enough = count == 2
             lightest = math.inf
             for i in range(count):
                 lightest = min(lightest, weight[i])
-            if not enough and lightest < min_weight:
-                count -= 1
-            else:
-                enough = True
-        solve(matrix, controls[c], count)
+            if count == 2 or lightest >= min_weight:
+                solved = solve(matrix, controls[c], count)
+        if not solved:  # All points are one.
+            for j in range(3):
+                controls[c, 0, j] = controls[c, 1, j] = means[c, j]
         counts[c] = count
 
 

@@ -160,6 +160,8 @@ def fit_region(
     n = len(u)
     knots = np.zeros((MAX_KNOTS, 3))
     quality = np.zeros(QUALITY)
+    if n == 0:
+        return 0, knots, quality
     mu, mv, au, av = principal_axis(u, v)
     s = (u - mu) * au + (v - mv) * av
     q = (v - mv) * au - (u - mu) * av

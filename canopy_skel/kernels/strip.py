@@ -47,7 +47,7 @@ def measure(mask: NDArray[np.bool_], strip: NDArray[np.float64]) -> None:
             if mask[v, u]:
                 t = (u - mu) * du + (v - mv) * dv
                 area[min(int((t - low) * per_px), sections - 1)] += 1.0
-    if sections > 4:
+    if sections > 4 and area[1:-1].sum() > 0.0:
         # Those at the ends are cut off slantwise.
         area = area[1:-1]
     area = np.sort(area)

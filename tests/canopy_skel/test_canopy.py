@@ -202,6 +202,13 @@ def test_a_wall_is_no_branch():
     assert len(pieces_of(view, regions, thicker, fragments=False)) == 1
 
 
+def test_a_mask_without_pixels_is_dropped_and_the_others_are_not():
+    masks = list(RecordedSegmenter().segment(PLAIN))
+    hollow = replace(masks[0], instance=99, mask=np.zeros((4, 9), np.bool_))
+    seen = observe(PLAIN, [hollow, *masks], PieceConfig(), FragmentConfig())
+    assert (len(seen.splines), seen.dropped) == (len(masks), (99,))
+
+
 def test_wood_of_the_next_row_is_not_of_this_tree():
     behind = PLAIN.instances == 3
     view = replace(PLAIN, depth_m=np.where(behind, np.float32(4.2), PLAIN.depth_m))

@@ -71,6 +71,14 @@ def test_leaves_over_a_third_of_the_edge_do_not_make_wood_thin(angle_deg):
     assert width_px(bitten) == pytest.approx(16.0, rel=0.08)
 
 
+def test_wood_of_which_only_both_ends_show_has_a_width():
+    mask = np.zeros((5, 100), np.bool_)
+    mask[:4, :5] = mask[:4, -5:] = True
+    strip = np.empty(5)
+    measure(mask, strip)
+    assert strip[0] == pytest.approx(2.0, rel=0.25)
+
+
 def test_wood_at_the_edge_of_the_picture_is_no_thicker():
     """The picture stretches what lies far off its axis; the ray sees the wood's own width."""
     radius_m, wide = (

@@ -78,6 +78,21 @@ def test_an_empty_span_means_fewer_control_points():
     np.testing.assert_allclose(spline.control_points_in_base[:, 0], [0.0, 0.2], atol=1e-4)
 
 
+def test_points_in_three_rows_do_not_tell_four_control_points_apart():
+    for middle in (0.0, 1e-3, -2e-3):
+        x = np.repeat([-0.02, middle, 0.02], 8)
+        points = np.column_stack([x, np.tile(np.arange(8.0) / 1000, 3), np.zeros(24)])
+        spline = fit_spline(cluster_of(points), LITERAL)
+        assert len(spline.control_points_in_base) == 3
+        np.testing.assert_allclose(spline.control_points_in_base[[0, 2], 0], [-0.02, 0.02])
+        np.testing.assert_allclose(spline.control_points_in_base[:, 1], 0.0035, atol=1e-9)
+
+
+def test_points_that_are_all_one_give_a_spline_without_length():
+    spline = fit_spline(cluster_of(np.full((1000, 3), 0.1)), LITERAL)
+    np.testing.assert_allclose(spline.control_points_in_base, np.full((2, 3), 0.1))
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_a_rigid_motion_moves_the_spline(seed):
     random = np.random.default_rng(seed)
