@@ -17,11 +17,12 @@ PACKAGE = "canopy_skel.kernels"
 
 
 def compile_kernels() -> None:
-    """Have all kernels on disk; returns at once where any is there already.
+    """Have all kernels on disk; returns at once where any is there already, or none may be written.
 
     What is missing or out of date then is compiled on import, as ever.
     """
-    if _any_on_disk():
+    folder = _kept_in()
+    if not os.access(folder.parent, os.W_OK) or any(folder.rglob("*.nbi")):
         return
     print("compiling the kernels, once", file=sys.stderr)  # noqa: T201 - before any other output
     spawn = multiprocessing.get_context("spawn")
@@ -41,11 +42,10 @@ def _import(module: str) -> None:
     importlib.import_module(module)
 
 
-def _any_on_disk() -> bool:
-    """Whether numba has put anything where it puts these kernels."""
+def _kept_in() -> Path:
+    """Return the folder numba keeps these kernels in."""
     elsewhere = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(elsewhere) if elsewhere else Path(str(files(PACKAGE))) / "__pycache__"
-    return any(folder.rglob("*.nbi"))
+    return Path(elsewhere) if elsewhere else Path(str(files(PACKAGE))) / "__pycache__"
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
 from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
 from service.outputs import require_writable, write_all
+from service.rig import ScanStatus
 from service.skeletons import SEGMENTERS
 
 
@@ -58,18 +59,21 @@ def scan(
     contents = {f"{status.scan_id}.mcap": fetch(url, f"/v1/scans/{status.scan_id}/recording.mcap")}
     if result.skeleton is not None:
         contents[f"{status.scan_id}.skeleton.json"] = result.skeleton
-    files = [str(file) for file in write_all(output, contents)]
-    if as_json:
-        typer.echo(json.dumps({"scan_id": status.scan_id, "state": status.state, "files": files}))
-    else:
-        typer.echo(
-            f"scan {status.scan_id} is {status.state}: {status.views_done} of"
-            f" {status.views_total} views" + (f"; {status.detail}" if status.detail else "")
-        )
-        for file in files:
-            typer.echo(f"  {file}")
+    _report(status, [str(file) for file in write_all(output, contents)], as_json=as_json)
     if status.state != "done":
         raise typer.Exit(Exit.FAILED)
     if not result.complete:
         stderr.print("warning: the worker has not finished the skeleton of all views")
         raise typer.Exit(Exit.PARTIAL)
+
+
+def _report(status: ScanStatus, files: list[str], *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps({"scan_id": status.scan_id, "state": status.state, "files": files}))
+        return
+    typer.echo(
+        f"scan {status.scan_id} is {status.state}: {status.views_done} of"
+        f" {status.views_total} views" + (f"; {status.detail}" if status.detail else "")
+    )
+    for file in files:
+        typer.echo(f"  {file}")

@@ -72,10 +72,10 @@ def _imported(module: str) -> tuple[str, ...]:
 
 def _file(module: str) -> Traversable | None:
     package, *rest = module.split(".")
-    place = files(package).joinpath(*rest)
-    if place.is_dir():
-        return place / "__init__.py"
-    source = place.parent / f"{place.name}.py"  # type: ignore[attr-defined]  # of a folder on disk
+    folder = files(package).joinpath(*rest)
+    if folder.is_dir():
+        return folder / "__init__.py"
+    source = files(package).joinpath(*rest[:-1], f"{rest[-1]}.py")
     return source if source.is_file() else None
 
 
