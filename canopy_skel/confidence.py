@@ -67,12 +67,16 @@ def fit_logistic(features: FloatArray, right: ArrayLike, ridge: float = 1.0) -> 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Models:
-    """All models of mode `canopy`, by what they judge, and where they come from."""
+    """All models of mode `canopy`, by what they judge, and where they come from.
+
+    link judges a possible link as a whole, joint a place on a link that was made.
+    """
 
     instance_point: Logistic
     fragment_point: Logistic
     vertex: Logistic
     link: Logistic
+    joint: Logistic
     extension: Logistic
     provenance: str
 

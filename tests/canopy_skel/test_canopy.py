@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scenes.leaves import GAP, leafy_view
 from scenes.wood import WOOD, view_from
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.canopy import CanopyConfig, CanopyScan, canopy_config_from, piece_means
 from canopy_skel.confidence import (
@@ -19,11 +21,11 @@ from canopy_skel.confidence import (
     shipped_models,
 )
 from canopy_skel.document import Method, build_document, from_json, to_json
-from canopy_skel.ends import find_ends
+from canopy_skel.ends import Ends, find_ends
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
 from canopy_skel.geometry import transform_points
-from canopy_skel.links import Candidates, accepted
+from canopy_skel.links import Candidates, LinkConfig, Parts, forest_of, links_to_make, places_on
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
@@ -321,7 +323,7 @@ def test_every_forest_has_an_end_per_tip_and_two_per_lone_vertex(points, parents
     ),
     threshold=st.floats(0.1, 0.9),
 )
-def test_links_make_a_forest_use_each_end_once_and_take_the_best(links, threshold):
+def test_links_make_a_forest_that_joins_all_they_may_by_the_best(links, threshold):
     links = [link for link in links if link[0] != link[1]]
     end = np.array([a for a, *_ in links], dtype=np.int64)
     vertex = np.array([b for _, b, *_ in links], dtype=np.int64)
@@ -335,17 +337,70 @@ def test_links_make_a_forest_use_each_end_once_and_take_the_best(links, threshol
         features=np.zeros((len(links), 20)),
     )
     component = np.arange(10)
-    made = accepted(candidates, probability, component, component, threshold)
-    used = [*end[made].tolist(), *other[made][other[made] >= 0].tolist()]
-    assert len(used) == len(set(used))
-    assert (probability[made] >= threshold).all()
+    allowed = probability >= threshold
+    made = forest_of(candidates, probability, allowed, component, component)
+    assert allowed[made].all()
     root = list(range(10))
     for i in made.tolist():
         a, b = root[end[i]], root[vertex[i]]
         assert a != b
         root = [a if r == b else r for r in root]
-    if len(links) and probability.max() >= threshold:
-        assert probability[made].max() == probability.max()
+    # Any link left out closes a ring of links that are all at least as probable.
+    for i in np.flatnonzero(allowed).tolist():
+        better = made[probability[made] >= probability[i]]
+        _, part = connected_components(
+            coo_array((np.ones(len(better)), (end[better], vertex[better])), shape=(10, 10)),
+            directed=False,
+        )
+        assert part[end[i]] == part[vertex[i]]
+
+
+def one_link(*, fragment=False, empty=0.0):
+    """Return two parts 0.1 m apart and the straight link between their ends."""
+    features = np.zeros((1, 42))
+    features[0, [1, 6, 15, 16]] = 0.1, empty, 0.9, 0.8
+    along = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    parts = Parts(
+        points=np.array([[0.0, 0, 0], [0.1, 0, 0]]),
+        directions=along,
+        component=np.arange(2),
+        length_m=np.full(2, 0.1),
+        confidence=np.array([0.9, 0.8]),
+        radius_m=np.full(2, 0.005),
+        fragment=np.array([False, fragment]),
+        ends=Ends(vertex=np.arange(2), tangents=along, behind_m=np.full(2, 0.1)),
+    )
+    candidates = Candidates(
+        end=np.array([0]),
+        vertex=np.array([1]),
+        other=np.array([1]),
+        curves=np.linspace(parts.points[0], parts.points[1], 17)[None],
+        features=features,
+    )
+    return parts, candidates
+
+
+@pytest.mark.parametrize(
+    ("kind", "probability", "made"),
+    [({}, 0.3, 1), ({}, 0.2, 0), ({"fragment": True}, 0.3, 0), ({"empty": 0.4}, 0.9, 0)],
+)
+def test_a_link_must_be_probable_more_so_to_a_fragment_and_not_run_through_the_empty(
+    kind, probability, made
+):
+    config = LinkConfig(min_probability=0.25, min_fragment_probability=0.4, max_empty=0.3)
+    assert len(links_to_make(*one_link(**kind), np.array([probability]), config)) == made
+
+
+def test_places_on_a_link_lie_evenly_within_it_and_know_how_far_its_lips_are():
+    _, candidates = one_link()
+    places = places_on(candidates, np.array([0]), np.array([0.5]), 0.03)
+    np.testing.assert_allclose(places.points[:, 0], [0.025, 0.05, 0.075])
+    np.testing.assert_allclose(places.features[:, 0], 0.0, atol=1e-12)  # even odds
+    np.testing.assert_allclose(places.features[:, 1:3], [[0.9, 0.8]] * 3)
+    np.testing.assert_allclose(
+        places.features[:, 3:], [[0.025, 0.075], [0.05, 0.05], [0.025, 0.075]]
+    )
+    assert places.first.tolist() == [0, 3]
 
 
 def test_a_fitted_logistic_means_what_it_says():
