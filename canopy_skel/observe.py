@@ -22,10 +22,11 @@ from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import (
     FragmentConfig,
     at_tree,
-    colour_wood_probability,
     fragments_of,
     mask_image,
+    wood_probability,
 )
+from canopy_skel.woodpixels import shipped_pixel_model
 
 SAMPLE_M = 0.005
 _NEAR_M = 0.02
@@ -99,11 +100,13 @@ def observe(
         wood &= ~(depth_of(view) > pieces_config.farthest_m)
     if fragments_config is not None:
         if probability is None:
-            probability = colour_wood_probability(view, wood, fragments_config)
+            limit = fragments_config.min_probability
+            probability = wood_probability(view, wood, fragments_config, shipped_pixel_model())
         else:
+            limit = fragments_config.min_detected
             outside = at_tree(view, wood, fragments_config) & ~wood
             probability = np.where(outside, probability, np.float32(0))
-        fragments = fragments_of(probability, fragments_config)
+        fragments = fragments_of(probability, limit, fragments_config)
         pieces += pieces_of(view, fragments, pieces_config, fragments=True)
         wood[fragments.v, fragments.u] = True
     points, directions, of = sampled(pieces)
