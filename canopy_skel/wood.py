@@ -19,14 +19,14 @@ class FragmentConfig:
 
     Pixels outside the masks with a wood probability of at least `min_probability` (`min_detected`
     where a detector gives it), connected, at least `min_px`. Pixels whose colour has log odds under
-    `min_log_odds` are not asked. They count within `margin_m` of the depths the masks span, so that rows behind
-    stay out. Colours are told apart in Lab bins after smoothing; `shrink_px` pixels of
+    `min_log_odds` are not asked. They count within `margin_m` of the depths the masks span, so that
+    rows behind stay out. Colours are told apart in Lab bins after smoothing; `shrink_px` pixels of
     nothing-known are added to each, so that a colour seldom seen says little.
     """
 
     min_probability: float = 0.3
     min_detected: float = 0.6
-    min_log_odds: float = -1.0
+    min_log_odds: float = -1.5
     blur_px: int = 3
     min_px: int = 10
     max_px: int = 4000

@@ -22,7 +22,6 @@ _BATCH = 2048
 _FASTEST = 0.006
 _MOST_ODDS = 4.0
 _BLUR_PX = 0.7
-_RIM_PX = max(around.RINGS_PX)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -45,8 +44,8 @@ class PixelModel:
         odds = around.wood_log_odds(
             layers,
             mean_odds,
-            v + _RIM_PX,
-            u + _RIM_PX,
+            v,
+            u,
             self.first,
             self.first_bias,
             self.second,
@@ -56,21 +55,22 @@ class PixelModel:
 
 
 def layers_of(view: View, covered: BoolArray, log_odds: Float32Array) -> Float32Array:
-    """Return what the model looks at (H, W, 4), mirrored at the rims; see `kernels.around`."""
+    """Return what the model looks at (H, W, 4); see `kernels.around`."""
     lightness = cv2.cvtColor(view.color_rgb, cv2.COLOR_RGB2Lab)[..., 0].astype(np.float32) / 255
     clipped = np.clip(log_odds, -_MOST_ODDS, _MOST_ODDS)
     layers = [cv2.GaussianBlur(one, (0, 0), _BLUR_PX) for one in (clipped, lightness)]
     depth_m = np.nan_to_num(depth_of(view), nan=0.0, posinf=0.0)
-    stacked = np.dstack([*layers, depth_m, covered]).astype(np.float32)
-    rim = (_RIM_PX,) * 4
-    return np.asarray(cv2.copyMakeBorder(stacked, *rim, cv2.BORDER_REFLECT), dtype=np.float32)
+    stacked = np.empty((*covered.shape, 4), dtype=np.float32)
+    for k, layer in enumerate((*layers, depth_m, covered)):
+        stacked[..., k] = layer
+    return stacked
 
 
 def figures_of(
     layers: Float32Array, mean_odds: Float32Array, v: IntArray, u: IntArray
 ) -> Float32Array:
     """Return what the model is told of pixels (v, u): (N, FIGURES)."""
-    return around.figures_around(layers, mean_odds, v + _RIM_PX, u + _RIM_PX)
+    return around.figures_around(layers, mean_odds, v, u)
 
 
 def fit_pixels(

@@ -1,4 +1,4 @@
-"""What lies around a pixel, in rings: does something like it go on along a line, and what beside?"""
+"""What lies around a pixel, in rings: does its like go on along a line, and what lies beside it?"""
 
 import math
 
@@ -84,7 +84,10 @@ def pixel_figures(
     row[0], row[1], row[2] = mean_odds[i], layers[y, x, 0], z
     for r in range(len(offsets)):
         for k in range(DIRECTIONS):
-            ring[k] = layers[y + offsets[r, k, 0], x + offsets[r, k, 1]]
+            at_y = min(max(y + offsets[r, k, 0], 0), layers.shape[0] - 1)
+            at_x = min(max(x + offsets[r, k, 1], 0), layers.shape[1] - 1)
+            for layer in range(4):
+                ring[k, layer] = layers[at_y, at_x, layer]
         ring_figures(ring, lightness, z, row[OWN + r * PER_RING : OWN + (r + 1) * PER_RING])
 
 
@@ -92,7 +95,7 @@ def pixel_figures(
 def figures_around(
     layers: Floats32, mean_odds: Floats32, v: NDArray[np.int64], u: NDArray[np.int64]
 ) -> Floats32:
-    """Return the figures (N, FIGURES) of pixels (v, u), at least the widest ring off the rims.
+    """Return the figures (N, FIGURES) of pixels (v, u); the picture goes on beyond its rims.
 
     layers: (H, W, 4) log odds of wood by colour, lightness, depth_m (0: none), under a mask.
     """
