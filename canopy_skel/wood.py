@@ -26,7 +26,7 @@ class FragmentConfig:
 
     min_probability: float = 0.3
     min_detected: float = 0.6
-    min_log_odds: float = -1.5
+    min_log_odds: float = -1.0
     blur_px: int = 3
     min_px: int = 10
     max_px: int = 4000
@@ -66,6 +66,8 @@ def wood_probability(
     probability = np.zeros(covered.shape, dtype=np.float32)
     log_odds, mean_odds = colour_log_odds(view, covered, config)
     v, u = asked_pixels(mean_odds, config)
+    if len(v) == 0:
+        return probability
     layers = layers_of(view, covered, log_odds)
     probability[v, u] = model.probability(layers, mean_odds[v, u], v, u)
     return probability

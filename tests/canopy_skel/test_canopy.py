@@ -273,7 +273,7 @@ def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
     assert counts[2, HIDDEN] == 2
 
 
-def test_colour_tells_unmasked_wood_from_leaves():
+def test_unmasked_wood_is_told_from_leaves():
     view = PLAIN
     color = np.zeros((240, 320, 3), np.uint8)
     noise = np.random.default_rng(0).integers(-8, 9, color.shape)
@@ -288,7 +288,7 @@ def test_colour_tells_unmasked_wood_from_leaves():
     found = fragments_of(probability, config.min_probability, config)
     shown = np.zeros(wood.shape, bool)
     shown[found.v, found.u] = True
-    assert shown[view.instances == 3].mean() > 0.8
+    assert shown[view.instances == 3].mean() > 0.6
     assert shown[~wood].mean() < 0.01
     assert not shown[masked].any()
 
