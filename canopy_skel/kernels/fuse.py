@@ -138,6 +138,42 @@ def shift_across(
 
 
 @njit(cache=True, nogil=True)
+def spread_around(
+    chosen: Ints,
+    directions: Floats,
+    references: Floats,
+    weights: Floats,
+    keys: Ints,
+    cell_m: float,
+    bandwidth_m: float,
+    own_share: float,
+) -> Floats:
+    """Return how the references (R, 3) lie around some of them: covariances (C, 3, 3).
+
+    References lie sorted by the `keys` of their cells of `cell_m` and count within twice the
+    bandwidth, with Gaussian weights. `own_share` of the bandwidth squared is added along their own
+    `directions` (R, 3).
+    """
+    spread, found = np.zeros((len(chosen), 3, 3)), np.zeros(len(references), dtype=np.int64)
+    for c, i in enumerate(chosen):
+        total, mean = 0.0, np.zeros(3)
+        for j in found[: near(references[i], 2 * bandwidth_m, references, keys, cell_m, found)]:
+            way = references[j] - references[i]
+            weight = weights[j] * math.exp(-0.5 * (way * way).sum() / bandwidth_m**2)
+            total += weight
+            mean += weight * way
+            for a in range(3):
+                for b in range(3):
+                    spread[c, a, b] += weight * way[a] * way[b]
+        own = own_share * bandwidth_m**2
+        for a in range(3):
+            for b in range(3):
+                square = spread[c, a, b] - mean[a] * mean[b] / total
+                spread[c, a, b] = square / total + own * directions[i, a] * directions[i, b]
+    return spread
+
+
+@njit(cache=True, nogil=True)
 def thinned(order: Ints, start: Ints, neighbours: Ints) -> NDArray[np.bool_]:
     """Keep, in this order, each point none of whose neighbours is kept already."""
     kept = np.zeros(len(order), dtype=np.bool_)

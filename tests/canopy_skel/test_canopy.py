@@ -24,13 +24,21 @@ from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.ends import Ends, find_ends
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
+from canopy_skel.fusion import FusionConfig, Observations, turned
 from canopy_skel.geometry import transform_points
+from canopy_skel.kernels.around import FIGURES
 from canopy_skel.links import Candidates, LinkConfig, Parts, forest_of, links_to_make, places_on
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
 from canopy_skel.segmenters.recorded import RecordedSegmenter
-from canopy_skel.wood import FragmentConfig, WoodDetector, colour_wood_probability, fragments_of
+from canopy_skel.wood import FragmentConfig, WoodDetector, fragments_of, wood_probability
+from canopy_skel.woodpixels import (
+    fit_pixels,
+    pixel_model_from,
+    pixel_model_to,
+    shipped_pixel_model,
+)
 
 PLAIN = view_from(0)
 
@@ -267,7 +275,7 @@ def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
     assert counts[2, HIDDEN] == 2
 
 
-def test_colour_tells_unmasked_wood_from_leaves():
+def test_unmasked_wood_is_told_from_leaves():
     view = PLAIN
     color = np.zeros((240, 320, 3), np.uint8)
     noise = np.random.default_rng(0).integers(-8, 9, color.shape)
@@ -277,13 +285,45 @@ def test_colour_tells_unmasked_wood_from_leaves():
     depth_m = np.where(np.isnan(view.depth_m), np.float32(1.05), view.depth_m)
     masked = wood & (view.instances != 3)
     coloured = replace(PLAIN, color_rgb=color, depth_m=depth_m)
-    probability = colour_wood_probability(coloured, masked, FragmentConfig())
-    found = fragments_of(probability, FragmentConfig())
+    config = FragmentConfig()
+    probability = wood_probability(coloured, masked, config, shipped_pixel_model())
+    found = fragments_of(probability, config.min_probability, config)
     shown = np.zeros(wood.shape, bool)
     shown[found.v, found.u] = True
-    assert shown[view.instances == 3].mean() > 0.8
+    assert shown[view.instances == 3].mean() > 0.6
     assert shown[~wood].mean() < 0.01
     assert not shown[masked].any()
+
+
+def test_fragments_turn_along_what_lies_around_them_and_instances_do_not():
+    random = np.random.default_rng(3)
+    way = np.array([2.0, 1.0, 2.0]) / 3
+    points = np.linspace(0, 0.2, 41)[:, None] * way + random.normal(0, 0.001, (41, 3))
+    directions = random.normal(size=(41, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = Observations(
+        points_in_base=points,
+        directions=directions,
+        radius_m=np.full(41, 0.004),
+        probability=np.full(41, 0.8),
+        view=np.zeros(41, np.int64),
+        fragment=np.arange(41) > 0,
+    )
+    found = turned(seen, FusionConfig()).directions
+    assert np.abs(found[1:] @ way).min() > 0.95
+    assert np.array_equal(found[0], directions[0])
+
+
+def test_the_pixel_model_learns_what_is_not_linear_and_is_written_as_it_is():
+    random = np.random.default_rng(5)
+    figures = random.normal(2.0, 3.0, (6000, FIGURES)).astype(np.float32)
+    wood = (np.abs(figures[:, 3] - 2) > 3) & (figures[:, 40] > 0)
+    model = fit_pixels(figures, wood, np.ones(6000, np.float32), "noise")
+    hidden = np.maximum(figures @ model.first + model.first_bias, 0)
+    odds = hidden @ model.second + model.second_bias
+    assert ((odds > 0) == wood).mean() > 0.95
+    again = pixel_model_from(json.loads(pixel_model_to(model)))
+    assert np.allclose(again.first, model.first, rtol=1e-5)
 
 
 def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():

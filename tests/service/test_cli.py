@@ -16,6 +16,7 @@ from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter
+from canopy_skel.woodpixels import pixel_model_from, pixel_model_to
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,6 +57,22 @@ def test_fit_confidence_writes_models_that_know_where_they_come_from(canopy, tmp
         assert models_from(json.loads(models.read_bytes()))[kind].provenance == (
             f"fitted to 1 scans (masks {seen}; settings {settings}): leafy"
         )
+
+
+def test_fit_wood_writes_a_model_that_knows_where_it_comes_from(canopy, tmp_path):
+    path, output = tmp_path / "leafy.mcap", tmp_path / "wood.json"
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)])
+    code, _, stderr = canopy("fit-wood", path, "-o", output)
+    assert (code, "no true skeleton is attached" in stderr) == (1, True)
+    truth = build_document(
+        sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0
+    )
+    path.unlink()
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)], to_json(truth))
+    assert canopy("fit-wood", path, "-o", output)[0] == 0
+    model = pixel_model_from(json.loads(output.read_bytes()))
+    assert model.provenance == "fitted to 1 scans (masks recorded, drop25+false20): leafy"
+    assert pixel_model_to(model) == output.read_bytes()
 
 
 def sticks():
