@@ -26,6 +26,7 @@ from canopy_skel.observe import Observation, observe
 from canopy_skel.pieces import PieceConfig
 from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
 from canopy_skel.segment import BranchMask
+from canopy_skel.slivers import inside_thicker
 from canopy_skel.wood import FragmentConfig
 
 POINT_FEATURES = 46
@@ -148,15 +149,15 @@ class CanopyScan:
             fragment, models.fragment_point(features), models.instance_point(features)
         )
         limit = np.where(fragment, self.config.min_fragment_point, self.config.min_point)
-        kept = probability >= limit
         seen = Observations(
-            points_in_base=points[kept],
-            directions=directions[kept],
-            radius_m=radius_m[kept],
-            probability=probability[kept],
-            view=view[kept],
-            fragment=fragment[kept],
-        )
+            points_in_base=points,
+            directions=directions,
+            radius_m=radius_m,
+            probability=probability,
+            view=view,
+            fragment=fragment,
+        ).chosen(probability >= limit)
+        seen = seen.chosen(~inside_thicker(seen))
         fused = fuse(seen, self.config.fusion)
         corrections = pose_corrections(seen, fused, self.config.poses)
         if corrections:

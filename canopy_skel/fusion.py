@@ -57,6 +57,17 @@ class Observations:
     view: IntArray
     fragment: BoolArray
 
+    def chosen(self, stay: BoolArray) -> "Observations":
+        """Return the points (N,) that stay."""
+        return Observations(
+            points_in_base=self.points_in_base[stay],
+            directions=self.directions[stay],
+            radius_m=self.radius_m[stay],
+            probability=self.probability[stay],
+            view=self.view[stay],
+            fragment=self.fragment[stay],
+        )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Observed:
