@@ -27,7 +27,7 @@ from canopy_skel.wood import (
     mask_image,
     wood_probability,
 )
-from canopy_skel.woodpixels import shipped_pixel_model
+from canopy_skel.woodpixels import PixelModel, shipped_pixel_model
 
 SAMPLE_M = 0.005
 _NEAR_M = 0.02
@@ -84,11 +84,12 @@ def observe(
     pieces_config: PieceConfig,
     fragments_config: FragmentConfig | None,
     probability: Float32Array | None = None,
+    pixel_model: PixelModel | None = None,
 ) -> Observation:
     """Lift the masks of a view, and the fragments beside them, into base.
 
-    `probability` (H, W): of wood, from a detector; None: by colour. `fragments_config` None: no
-    fragments.
+    `probability` (H, W): of wood, from a detector; None: by colour and `pixel_model`, without one
+    that which is shipped. `fragments_config` None: no fragments.
 
     Raises:
         ViewError: the view has no depth.
@@ -102,7 +103,8 @@ def observe(
     if fragments_config is not None:
         if probability is None:
             limit = fragments_config.min_probability
-            probability = wood_probability(view, wood, fragments_config, shipped_pixel_model())
+            model = pixel_model or shipped_pixel_model()
+            probability = wood_probability(view, wood, fragments_config, model)
         else:
             limit = fragments_config.min_detected
             outside = at_tree(view, wood, fragments_config) & ~wood

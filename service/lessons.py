@@ -1,5 +1,6 @@
 """Recordings with truth, made ready to fit confidences to."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,12 +14,42 @@ from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
 from canopy_skel.wood import wood_of
+from canopy_skel.woodpixels import PixelModel
 from drivers.stereo import with_depth
 from service.experiment.segmenters import segmenter_named
+from service.pixellessons import pixel_model_of
 
 
-def lesson_from(path: Path, segmenter: str, *, use_fragments: bool = True) -> Lesson:
-    """Read a recording and take all its views in.
+def pixel_models_without(paths: Sequence[Path]) -> dict[Path, PixelModel | None]:
+    """Return for each recording a model of wood pixels that was fitted to other trees.
+
+    A model knows the trees it was fitted to better than others, and confidences learned there would
+    promise too much. Trees, by name without the foliage, are dealt out in two halves; where one is
+    empty there is nothing to fit to: None, the shipped model.
+
+    Raises:
+        RecordingError: one cannot be read, or has no truth.
+    """
+    trees = sorted({_tree(path) for path in paths})
+    halves = [[path for path in paths if trees.index(_tree(path)) % 2 == k] for k in (0, 1)]
+    if not all(halves):
+        return dict.fromkeys(paths)
+    models = [pixel_model_of(half, ("recorded",)) for half in halves]
+    return {path: models[1 - k] for k in (0, 1) for path in halves[k]}
+
+
+def _tree(path: Path) -> str:
+    return re.sub(r"_fd\d+$", "", path.stem)
+
+
+def lesson_from(
+    path: Path,
+    segmenter: str,
+    *,
+    use_fragments: bool = True,
+    pixel_model: PixelModel | None = None,
+) -> Lesson:
+    """Read a recording and take all its views in; wood pixels by the shipped model, or by this.
 
     Raises:
         RecordingError: it cannot be read, or has no truth.
@@ -30,7 +61,7 @@ def lesson_from(path: Path, segmenter: str, *, use_fragments: bool = True) -> Le
         raise RecordingError(
             f"{path}: no true skeleton is attached; record it with canopy simulate"
         )
-    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments))
+    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments), pixel_model)
     likelihood = LikelihoodMap(LikelihoodConfig())
     for view in recording.views():
         if isinstance(view, View):
@@ -42,13 +73,15 @@ def lesson_from(path: Path, segmenter: str, *, use_fragments: bool = True) -> Le
     return Lesson(scan=scan, likelihood=likelihood, truth=truth)
 
 
-def lessons_from(path: Path, masks: Sequence[str]) -> list[Lesson]:
+def lessons_from(
+    path: Path, masks: Sequence[str], pixel_model: PixelModel | None = None
+) -> list[Lesson]:
     """Read a recording with each kind of masks, and with the first once more without fragments.
 
     Raises: as `lesson_from`.
     """
     without = lesson_from(path, masks[0], use_fragments=False)
-    return [without, *(lesson_from(path, name) for name in masks)]
+    return [without, *(lesson_from(path, name, pixel_model=pixel_model) for name in masks)]
 
 
 def fitted(

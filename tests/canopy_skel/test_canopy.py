@@ -26,7 +26,6 @@ from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
 from canopy_skel.fusion import FusionConfig, Observations, turned
 from canopy_skel.geometry import transform_points
-from canopy_skel.kernels.around import FIGURES
 from canopy_skel.links import Candidates, LinkConfig, Parts, forest_of, links_to_make, places_on
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
@@ -317,12 +316,12 @@ def test_fragments_turn_along_what_lies_around_them_and_instances_do_not():
 
 def test_the_pixel_model_learns_what_is_not_linear_and_is_written_as_it_is():
     random = np.random.default_rng(5)
-    figures = random.normal(2.0, 3.0, (6000, FIGURES)).astype(np.float32)
-    wood = (np.abs(figures[:, 3] - 2) > 3) & (figures[:, 40] > 0)
-    model = fit_pixels(figures, wood, np.ones(6000, np.float32), "noise")
+    figures = random.normal(2.0, 3.0, (60000, 3)).astype(np.float32)
+    wood = (np.abs(figures[:, 0] - 2) > 3) & (figures[:, 1] > 0)
+    model = fit_pixels(figures, wood, np.ones(60000, np.float32), "noise")
     hidden = np.maximum(figures @ model.first + model.first_bias, 0)
     odds = hidden @ model.second + model.second_bias
-    assert ((odds > 0) == wood).mean() > 0.95
+    assert ((odds > 0) == wood).mean() > 0.85
     again = pixel_model_from(json.loads(pixel_model_to(model)))
     assert np.allclose(again.first, model.first, rtol=1e-5)
 
