@@ -21,7 +21,7 @@ class ExtensionConfig:
     step_m: float = 0.005
     reach_m: float = 0.15
     min_probability: float = 0.5
-    min_fragment_probability: float = 0.7
+    min_fragment_probability: float = 0.8
     clear_m: float = 0.012
 
 

@@ -28,7 +28,7 @@ class LinkConfig:
     reach_m: float = 0.25
     max_empty: float = 0.3
     min_probability: float = 0.2
-    min_fragment_probability: float = 0.35
+    min_fragment_probability: float = 0.4
     candidates: int = 6
     spacing_m: float = 0.008
 
