@@ -1,8 +1,9 @@
 """Recordings with truth, made ready to fit confidences to."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
+
+from scipy.spatial import cKDTree
 
 from canopy_skel.canopy import CanopyConfig, CanopyScan
 from canopy_skel.confidence import Masks, Models
@@ -39,7 +40,8 @@ def pixel_models_without(paths: Sequence[Path]) -> dict[Path, PixelModel | None]
 
 
 def _tree(path: Path) -> str:
-    return re.sub(r"_fd\d+$", "", path.stem)
+    """Return species and topology, which names of simulated scans begin with."""
+    return "_".join(path.stem.split("_")[:2])
 
 
 def lesson_from(
@@ -55,22 +57,8 @@ def lesson_from(
         RecordingError: it cannot be read, or has no truth.
         UsageError: there is no such segmenter.
     """
-    finder = segmenter_named(segmenter)
-    recording = read_recording(path)
-    if recording.ground_truth is None:
-        raise RecordingError(
-            f"{path}: no true skeleton is attached; record it with canopy simulate"
-        )
-    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments), pixel_model)
-    likelihood = LikelihoodMap(LikelihoodConfig())
-    for view in recording.views():
-        if isinstance(view, View):
-            usable = with_depth(view)
-            seen = scan.observe(usable, finder.segment(usable), wood_of(finder, usable))
-            likelihood.add(segments_of(seen.splines))
-            scan.add(view.index, seen)
-    truth = truth_points(from_json(recording.ground_truth, str(path)))
-    return Lesson(scan=scan, likelihood=likelihood, truth=truth)
+    views, truth = _views_and_truth(path)
+    return _lesson(views, truth, segmenter, use_fragments, pixel_model)
 
 
 def lessons_from(
@@ -80,8 +68,36 @@ def lessons_from(
 
     Raises: as `lesson_from`.
     """
-    without = lesson_from(path, masks[0], use_fragments=False)
-    return [without, *(lesson_from(path, name, pixel_model=pixel_model) for name in masks)]
+    views, truth = _views_and_truth(path)
+    without = _lesson(views, truth, masks[0], False, None)
+    return [without, *(_lesson(views, truth, name, True, pixel_model) for name in masks)]
+
+
+def _views_and_truth(path: Path) -> tuple[list[View], cKDTree]:
+    recording = read_recording(path)
+    if recording.ground_truth is None:
+        raise RecordingError(
+            f"{path}: no true skeleton is attached; record it with canopy simulate"
+        )
+    views = [with_depth(view) for view in recording.views() if isinstance(view, View)]
+    return views, truth_points(from_json(recording.ground_truth, str(path)))
+
+
+def _lesson(
+    views: Sequence[View],
+    truth: cKDTree,
+    segmenter: str,
+    use_fragments: bool,
+    pixel_model: PixelModel | None,
+) -> Lesson:
+    finder = segmenter_named(segmenter)
+    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments), pixel_model)
+    likelihood = LikelihoodMap(LikelihoodConfig())
+    for view in views:
+        seen = scan.observe(view, finder.segment(view), wood_of(finder, view))
+        likelihood.add(segments_of(seen.splines))
+        scan.add(view.index, seen)
+    return Lesson(scan=scan, likelihood=likelihood, truth=truth)
 
 
 def fitted(
