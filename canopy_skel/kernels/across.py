@@ -19,9 +19,10 @@ def draw(
     point: Floats,
     direction: Floats,
 ) -> bool:
-    """Move a point by the mean of weighted offsets, across the mean heading, which becomes its direction.
+    """Move a point by the mean offset, across the mean heading, which becomes its direction.
 
-    False, and nothing is done, where there are none or the headings cancel out.
+    offset, heading: weighted sums; total: of the weights. False, and nothing is done, where there
+    are none or the headings cancel out.
     """
     ex, ey, ez = heading
     norm = math.sqrt(ex * ex + ey * ey + ez * ez)

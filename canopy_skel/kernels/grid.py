@@ -1,4 +1,4 @@
-"""Where a voxel is in a two-level grid: a dense top table of blocks, and a slot per voxel of these."""
+"""Where a voxel is in a two-level grid: a dense top table of blocks, a slot per voxel of these."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -20,7 +20,7 @@ def root_of(parent: Int32s, label: int) -> int:
 
 @kernel("int64[::1](int64[:,::1], int32[::1])")
 def span(ends: Ints, parent: Int32s) -> Ints:
-    """Return which edges a minimum spanning forest takes, (N, 3) sorted by cost: any, and two labels.
+    """Return which edges (N, 3) sorted by cost, of each anything and two labels, span a forest.
 
     `parent` is the union-find of the labels, changed.
     """
