@@ -83,17 +83,13 @@ def link_candidates(
     the `most` with the least gap x (1 + 1.5 (1 - cos A) + 0.5 (1 - cos B)), 0.4 for the last term
     where the other vertex is no end. `vertex_end` (V, 2): the ends at each vertex, -1 for none.
     """
-    found = 0
-    ends = np.zeros(len(end_points) * most, dtype=np.int64)
-    vertices = np.zeros(len(end_points) * most, dtype=np.int64)
-    others = np.zeros(len(end_points) * most, dtype=np.int64)
-    ranks = np.zeros(len(end_points) * most)
-    best = np.empty((components, 2))
+    found, room = 0, len(end_points) * most
+    ends, vertices = np.zeros(room, dtype=np.int64), np.zeros(room, dtype=np.int64)
+    others, ranks = np.zeros(room, dtype=np.int64), np.zeros(room)
+    best = np.full((components, 2), math.inf)
     best_vertex = np.zeros((components, 2), dtype=np.int64)
     best_other = np.zeros((components, 2), dtype=np.int64)
     touched = np.zeros(components, dtype=np.int64)
-    for c in range(components):
-        best[c, 0] = best[c, 1] = math.inf
     for i in range(len(end_points)):
         count = 0
         for j in range(len(points)):

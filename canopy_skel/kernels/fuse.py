@@ -102,13 +102,11 @@ def shift_across(
             wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
             weight = weights[j] * math.exp(-0.5 * (wx * wx + wy * wy + wz * wz) / (width * width))
             signed = weight if cosine > 0.0 else -weight
-            total += weight
+            total, masks = total + weight, masks + (0.0 if fragment[j] else weight)
             ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
             ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
-            r += weight * reference_radii[j]
-            mean_p += weight * probability[j]
+            r, mean_p = r + weight * reference_radii[j], mean_p + weight * probability[j]
             largest, bits = max(largest, probability[j]), bits | view_bits[j]
-            masks += 0.0 if fragment[j] else weight
         if draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i]):
             support[i, 0], support[i, 1], support[i, 2] = total, r / total, mean_p / total
             support[i, 3], support[i, 4], support[i, 5] = largest, bits_in(bits), masks / total

@@ -54,7 +54,6 @@ def paper_table(
     Rows that are there already are kept: after an interruption the same command goes on, and an
     orchard that still grows may be used at any time.
     """
-    # Imported here: that compiles kernels which no other verb needs.
     from service.experiment.run import Experiment, run
 
     choice = Choice(
@@ -81,13 +80,12 @@ def paper_table(
         "foliage": foliage,
     }
     files = _write(output, _command(orchard, output, options), plan, rows, figures=figures)
-    code = _complain(plan.orchard, rows)
     if as_json:
         typer.echo(json.dumps(_summary(plan, rows, files), indent=2))
     else:
         for file in files:
             typer.echo(file)
-    raise typer.Exit(code)
+    raise typer.Exit(_complain(plan.orchard, rows))
 
 
 def _command(orchard: Path, output: Path, options: dict[str, str]) -> str:
