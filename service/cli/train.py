@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import Progress, TaskID
@@ -13,7 +13,9 @@ from canopy_skel.errors import UsageError
 from service.cli.labels import Branch, Coco, Images, LabelMe, Labels
 from service.cli.shell import AsJson, Out, progress_bars, stderr
 from service.outputs import require_writable
-from service.training.user_pictures import UserPicture
+
+if TYPE_CHECKING:
+    from service.training.user_pictures import UserPicture
 
 RECIPES = ("builtin",)
 NETWORKS = ("unet", "maskrcnn")
@@ -116,7 +118,7 @@ def _by_recipe(
 
 def _on_labels(
     output: Path,
-    pictures: list[UserPicture],
+    pictures: "list[UserPicture]",
     segmenter: str,
     init: str | None,
     length: _Length,
@@ -131,7 +133,7 @@ def _on_labels(
 
 
 def _unet(
-    output: Path, pictures: list[UserPicture], init: str | None, length: _Length, show: Show
+    output: Path, pictures: "list[UserPicture]", init: str | None, length: _Length, show: Show
 ) -> tuple[tuple[str, ...], Facts]:
     from canopy_skel.segmenters.unet import weights
     from service.training.user_recipe import FINE_PLAN, SCRATCH_PLAN, user_weights
@@ -144,7 +146,7 @@ def _unet(
 
 
 def _maskrcnn(
-    output: Path, pictures: list[UserPicture], init: str | None, length: _Length, show: Show
+    output: Path, pictures: "list[UserPicture]", init: str | None, length: _Length, show: Show
 ) -> tuple[tuple[str, ...], Facts]:
     from service.training.maskrcnn import MaskRcnnPlan
     from service.training.maskrcnn_recipe import initial, maskrcnn_weights
