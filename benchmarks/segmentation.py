@@ -35,7 +35,7 @@ SHOWN = {
     "recall": "recall",
     "pixel_iou": "pixel IoU",
     "cl_dice": "clDice",
-    "ece_wood": "ECE",
+    "ece_wood": "ECE (wood)",
     "instances_true": "branches",
 }
 ENDS = (

@@ -12,7 +12,7 @@ from rich.progress import Progress, TaskID
 
 from canopy_skel.errors import UsageError
 from canopy_skel.pipeline import METHODS
-from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
+from service.cli.shell import WIDEST_RANGE, AsJson, Exit, Out, progress_bars, stderr
 from service.experiment.orchard import Choice, Orchard, read_orchard
 from service.experiment.report import Report, rows_csv
 from service.experiment.rows import Row, RowStore
@@ -176,5 +176,8 @@ def _numbers(text: str) -> tuple[int, ...]:
         first, dash, last = part.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
             raise UsageError(f"{text!r}: give numbers as 0,3,5-7")
-        numbers += range(int(first), int(last or first) + 1)
+        ends = int(first), int(last or first)
+        if not 0 <= ends[1] - ends[0] < WIDEST_RANGE:
+            raise UsageError(f"{text!r}: {part} is no range; give the smaller number first")
+        numbers += range(ends[0], ends[1] + 1)
     return tuple(dict.fromkeys(numbers))

@@ -64,14 +64,17 @@ def train(
     """Train a segmenter on your labelled pictures, or anew on synthetic ones.
 
     OUTPUT gets the weights (unet.pt and unet.json, or maskrcnn.*), the pictures, checkpoints and
-    the log; a broken-off run is gone on with.
+    the log; a broken-off run of unet is gone on with.
     """
+    _require_amounts(minutes=minutes, steps=steps, scenes=scenes)
     if segmenter not in NETWORKS:
         raise UsageError(f"unknown segmenter {segmenter!r}: choose one of {', '.join(NETWORKS)}")
     length = _Length(minutes=minutes, steps=steps)
     weights = output / f"{segmenter}.pt"
     labels = Labels(coco=coco, images=images, labelme=labelme, branch=branch or ())
     if labels.source is None:
+        if images is not None or branch or init is not None:
+            raise UsageError("--images, --branch and --init go with labels: give --coco, --labelme")
         facts = _by_recipe(output, recipe or BUILTIN, segmenter, length, scenes)
     elif recipe is not None or scenes is not None:
         raise UsageError("give either labels (--coco, --labelme) or --recipe")
@@ -84,6 +87,12 @@ def train(
     typer.echo(f"  judged on: {facts['validation']['kind']}")
     for name, value in facts["validation"]["reported"].items():
         typer.echo(f"  {name:24} {'none' if value is None else f'{value:g}'}")
+
+
+def _require_amounts(**amounts: float | None) -> None:
+    for name, amount in amounts.items():
+        if amount is not None and not amount > 0:
+            raise UsageError(f"--{name} {amount}: give more than 0")
 
 
 def _by_recipe(
