@@ -46,7 +46,7 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python benchmarks/stages.py --output docs/results
+	$(BIN)/python benchmarks/stages.py --output docs/results --keep out/bench
 
 bench-scan: $(RUNS)
 	$(BIN)/python benchmarks/waypoints.py

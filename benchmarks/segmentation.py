@@ -35,7 +35,7 @@ SHOWN = {
     "recall": "recall",
     "pixel_iou": "pixel IoU",
     "cl_dice": "clDice",
-    "ece_wood": "ECE",
+    "ece_wood": "ECE (wood)",
     "instances_true": "branches",
 }
 ENDS = (
@@ -160,8 +160,12 @@ def cpu_model():
 
 def page(results, seconds):
     facts = json.loads(BUILTIN.with_suffix(".json").read_text())
+    return "\n".join([*trained(facts), *end_to_end(results), *time_taken(seconds)])
+
+
+def trained(facts):
     training, validation = facts["training"], facts["validation"]
-    lines = [
+    return [
         "# The built-in weights of the unet segmenter, measured",
         "",
         "Made by `benchmarks/segmentation.py`. Every picture is synthetic: nothing here says how"
@@ -188,6 +192,11 @@ def page(results, seconds):
         "Seen, labelled (grey: too small), found:",
         "![Pictures of the reporting half in three columns](sheet.jpg)",
         "",
+    ]
+
+
+def end_to_end(results):
+    return [
         "## End to end, on recordings of another generator",
         "",
         "Skeletons from learned masks beside those from the recorded (true) masks, method `paper`.",
@@ -208,6 +217,11 @@ def page(results, seconds):
             ],
         ),
         "",
+    ]
+
+
+def time_taken(seconds):
+    return [
         "## Time",
         "",
         f"CPU seconds of one 1440 x 1080 picture, one thread, {cpu_model()}: "
@@ -215,7 +229,6 @@ def page(results, seconds):
         + ".",
         "",
     ]
-    return "\n".join(lines)
 
 
 def table(heads, rows):

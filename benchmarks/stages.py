@@ -1,11 +1,12 @@
 """Time every stage beside the obvious way to do it, in one run on the same input.
 
-    python benchmarks/stages.py [--quick] [--output docs/results] [part ...]
+    python benchmarks/stages.py [--quick] [--output docs/results] [--keep FOLDER] [part ...]
 
 Parts: stages, updates, alone, scaling, replay; all of them if none is named. Prints tables and,
 with --output, writes them to bench.md and the scaling curves to bench-scaling.png there. Times are
 CPU time of the thread, the least of some runs or the median over views: the machine's speed
-cancels out of the ratios, other jobs nearly do.
+cancels out of the ratios, other jobs nearly do. With --keep, what was measured in an earlier run
+is taken from that folder: an interrupted run goes on; empty the folder to measure anew.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import platform
 from pathlib import Path
 
 from parts import alone, closing, replay, scaling, stages, updates
+from parts.kept import Kept
 
 PARTS = {
     "stages": stages.report,
@@ -34,13 +36,15 @@ def main():
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS], default=[])
     parser.add_argument("--quick", action="store_true", help="10 and 5 mm, few views")
     parser.add_argument("--output", type=Path, help="folder for bench.md and the curves")
+    parser.add_argument("--keep", type=Path, help="folder for what is measured, and was")
     options = parser.parse_args()
+    kept = Kept(options.keep)
     machine = f"{platform.machine()}, Python {platform.python_version()}"
     how = "`make bench`" if not options.quick else "`benchmarks/stages.py --quick`"
     head, texts, facts = HEAD.format(machine=machine, how=how), [], {}
     print(head)
     for name in options.parts or PARTS:
-        text, found = PARTS[name](options.quick, options.output)
+        text, found = PARTS[name](options.quick, options.output, kept)
         print(text, flush=True)
         texts.append(text)
         facts |= found

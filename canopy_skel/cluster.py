@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canopy_skel.errors import ViewError
+from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, Intrinsics, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
 from canopy_skel.kernels import parts, trust
@@ -43,6 +43,23 @@ class ClusterConfig:
     connect_m: float = 0.03
     min_points: int = 20
     max_flatness: float = 0.55
+
+    def __post_init__(self) -> None:
+        """Refuse a range of depth that is none."""
+        require_range(self.nearest_m, self.farthest_m)
+
+
+def require_range(nearest_m: float, farthest_m: float) -> None:
+    """Check a range of depth: 0 stands for no depth at all.
+
+    Raises:
+        UsageError: it is empty, or begins at the camera.
+    """
+    if not 0.0 < nearest_m < farthest_m:
+        raise UsageError(
+            f"depth from {nearest_m} m to {farthest_m} m: give a nearest above 0 (no depth) and"
+            " below the farthest"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -134,6 +151,8 @@ def cluster_branches(
                 reasons.append("part too small")
             elif slender.flatness[part] > config.max_flatness:
                 reasons.append("not slender")
+            elif strip[0] > view.intrinsics.fx_px:  # Nobody can say how thick that is.
+                reasons.append("wider than 90 degrees")
             else:
                 clusters.append(
                     BranchCluster(

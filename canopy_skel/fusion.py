@@ -115,7 +115,7 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
             config.radius_share,
             np.cos(np.radians(config.max_angle_deg)),
         )
-        radius_m = support[:, 1]
+        radius_m = support[:, 1].copy()
     kept = _thinned(points, support[:, 0], config.spacing_m)
     points, directions, support = points[kept], directions[kept], support[kept]
     edges = forest(points, directions, config.reach_m)

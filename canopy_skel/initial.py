@@ -6,7 +6,7 @@ import numpy as np
 
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
-from canopy_skel.kernels import forest
+from canopy_skel.kernels import forest, unions
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.strands import SmoothingConfig, Strands
 from canopy_skel.voxels import VoxelIndex, grouped, voxels_of
@@ -78,7 +78,9 @@ def spanning_forest(points: FloatArray, voxel_size_m: float) -> IntArray:
     voxels = voxels_of(points, voxel_size_m)
     index = VoxelIndex(voxels)
     pairs, length = forest.neighbour_pairs(points, voxels, index.top, index.origin, index.slots)
-    return forest.kruskal(pairs[np.argsort(length, kind="stable")], len(points))
+    order = np.argsort(length, kind="stable")
+    edges = np.column_stack([order, pairs[order]])
+    return pairs[order[unions.span(edges, np.arange(len(points), dtype=np.int32))]]
 
 
 def prune_spurs(points: FloatArray, edges: IntArray, spur_m: float) -> tuple[IntArray, IntArray]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from canopy_skel.errors import UsageError
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.kernels import ellipsoid, sums
+from canopy_skel.kernels.grid import RUN
 from canopy_skel.spline import BranchSpline
 from canopy_skel.voxels import Int32Array, VoxelBlocks, grown
 
@@ -153,8 +154,7 @@ class LikelihoodMap:
 
     def merge(self, grid: LikelihoodGrid) -> None:
         """Add what another map of the same voxel size knows."""
-        x, y, z = grid.voxels.T
-        self.blocks.cover(np.stack([x, y, z, z + 1], axis=1))
+        self.blocks.cover(grid.voxels)
         self._grow()
         slots = self.blocks.slots_of(grid.voxels)
         total = self._sums[slots].astype(np.int64) + grid.units
@@ -206,8 +206,8 @@ class LikelihoodMap:
         self._grow()
         slopes, found = _slopes(rows, k), 0
         seen = np.empty(len(wide[1]) + len(thin[1]), dtype=np.int32)
-        totals = self._sums.reshape(-1, ellipsoid.RUN)
-        levels, marks = (a.reshape(-1, ellipsoid.RUN) for a in (self.levels, self._marks))
+        totals = self._sums.reshape(-1, RUN)
+        levels, marks = (a.reshape(-1, RUN) for a in (self.levels, self._marks))
         for runs in (wide, thin):
             found = sums.accumulate(*runs, slopes, sign, totals, marks, seen, found)
         self._changed.append(sums.renew_levels(seen[:found], totals, levels, LEVEL_TABLE, marks))

@@ -66,7 +66,7 @@ class Observation:
         """
         return agreement(
             points_in_base,
-            directions,
+            np.ascontiguousarray(directions),
             self.points_in_base[self.by_cell],
             self.directions[self.by_cell],
             self.fragment[self.by_cell],

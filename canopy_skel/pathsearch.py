@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.kernels import joins as kernels
-from canopy_skel.kernels import search
+from canopy_skel.kernels import search, steps, unions
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.voxels import Int32Array, VoxelIndex, distinct, grown, voxels_of
 
@@ -42,7 +42,7 @@ class PathSearch:
         self.settled = 0
         """How many voxels the last update or `joins` had to work on."""
         self._levels = np.zeros(512, dtype=np.uint8)
-        self._distance = np.full(512, search.UNREACHED, dtype=np.int32)
+        self._distance = np.full(512, steps.UNREACHED, dtype=np.int32)
         self._previous = np.full(512, NO_WAY, dtype=np.uint8)
         self._label = np.zeros(512, dtype=np.int32)
         self._marks = np.zeros(512, dtype=np.uint8)
@@ -61,7 +61,7 @@ class PathSearch:
 
     @property
     def distances(self) -> Int32Array:
-        """Cost from the nearest wood per slot of the map, `search.UNREACHED` where none leads."""
+        """Cost from the nearest wood per slot of the map, `steps.UNREACHED` where none leads."""
         return self._distance[: self._map.blocks.slots]
 
     def update(self, graph: SkeletonGraph) -> None:
@@ -95,7 +95,7 @@ class PathSearch:
         by (cost, voxel order), so the result does not depend on the order of anything.
         """
         edges, costs, ends, parent = self._cheapest()
-        tree = kernels.span(ends, parent.copy())
+        tree = unions.span(ends, parent.copy())
         slots, starts, totals, self.settled = kernels.join_all(
             edges,
             costs,
@@ -120,7 +120,7 @@ class PathSearch:
         Paths that were added do not serve as wood for later ones, so ways may run side by side.
         """
         edges, costs, ends, parent = self._cheapest()
-        taken = kernels.span(ends, parent)
+        taken = unions.span(ends, parent)
         paths = [self._trace(int(edges[i])) for i in taken]
         starts = np.cumsum([0, *map(len, paths)])[:-1]
         slots = np.concatenate([np.zeros(0, dtype=np.int64), *paths])
@@ -129,7 +129,7 @@ class PathSearch:
     def _grow(self) -> None:
         slots = self._map.blocks.slots
         self._levels = grown(self._levels, slots, 0)
-        self._distance = grown(self._distance, slots, search.UNREACHED)
+        self._distance = grown(self._distance, slots, steps.UNREACHED)
         self._previous = grown(self._previous, slots, NO_WAY)
         self._label = grown(self._label, slots, 0)
         self._marks = grown(self._marks, slots, 0)

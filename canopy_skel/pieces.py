@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canopy_skel.cluster import FARTHEST_M
+from canopy_skel.cluster import FARTHEST_M, require_range
 from canopy_skel.errors import ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
@@ -39,6 +39,10 @@ class PieceConfig:
     thickest_m: float = 0.15
     thickest_fragment_m: float = 0.04
     centre_shift: float = np.pi / 4
+
+    def __post_init__(self) -> None:
+        """Refuse a range of depth that is none."""
+        require_range(self.nearest_m, self.farthest_m)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

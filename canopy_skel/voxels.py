@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canopy_skel.geometry import FloatArray, IntArray
-from canopy_skel.kernels import blocks
+from canopy_skel.kernels import blocks, grid
 
 Int32Array = NDArray[np.int32]
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -73,15 +73,18 @@ class VoxelBlocks:
     @property
     def slots(self) -> int:
         """How many slots there are, those of block 0 included."""
-        return self.count * blocks.SLOTS
+        return self.count * grid.SLOTS
 
-    def cover(self, rows: Int32Array) -> None:
-        """Allocate the blocks that rows (R, 4) of x, y, first z, end z touch."""
-        if len(rows) == 0:
+    def cover(self, voxels: Int32Array) -> None:
+        """Allocate the blocks that hold voxels (N, 3)."""
+        if len(voxels) == 0:
             return
-        rows = np.ascontiguousarray(rows)
-        self.span(*blocks.bounds(rows))
-        self.number(blocks.allocate(self.top, self.origin, rows, self.count))
+        block = voxels.astype(np.int64) >> 3
+        self.span(block.min(axis=0), block.max(axis=0) + 1)
+        used = np.unique(np.ravel_multi_index(tuple((block - self.origin).T), self.top.shape))
+        fresh = used[self.top.ravel()[used] == 0]
+        self.top.ravel()[fresh] = self.count + np.arange(len(fresh))
+        self.number(self.count + len(fresh))
 
     def number(self, count: int) -> None:
         """Take over the blocks below `count` that were entered into `top`."""

@@ -1,12 +1,17 @@
 """What a process of its own takes: memory of a scan, time to the first skeleton."""
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import perf_counter
+
+from parts.common import table
 
 ROOT = Path(__file__).parents[2]
+RECORDING = ROOT / "recordings/demo_apple.mcap"
 SCAN = """
 from parts.alone import peak_mb
 from parts.common import Engine, clusters_of_views
@@ -17,26 +22,50 @@ for clusters in views:
     update(engine, clusters)
 print(before, peak_mb())
 """
-START = """
-import time
-from contextlib import nullcontext
-from service.live import warm_up
-warm_up(lambda name: nullcontext())
-print(time.process_time())
-"""
+START = "from service.start import main; main()"
+METHODS = ("canopy", "paper")
 
 
-def report(quick, _output):
-    before, peak = run(SCAN.format(views=20 if quick else 70))
-    with TemporaryDirectory() as cache:
-        (cold,), (warm,) = (run(START, NUMBA_CACHE_DIR=cache) for _ in range(2))
+def report(quick, _output, kept):
+    views = 20 if quick else 70
+    before, peak = kept(f"memory-{views}", lambda: memory_mb(views))
+    rows = [row for method in METHODS for row in kept(f"start-{method}", lambda m=method: first(m))]
     text = (
         "## A process of its own\n\n"
         f"5 mm, 2 x 2 x 2 m, a skeleton after each view: {peak:.0f} MB at most, {before:.0f} MB of"
-        " them libraries and input.\n\nFrom the start of Python to the first skeleton:"
-        f" {cold:.1f} CPU-s with nothing compiled yet, {warm:.1f} with kernels on disk.\n"
+        " them libraries and input.\n\n"
     )
-    return text, {"memory": peak, "cold": cold, "warm": warm}
+    head = ("method", "kernels", "clock s", "CPU s of all processes", "load before")
+    text += table(f"`canopy replay` of {RECORDING.stem} (4 views), start to end", head, rows)
+    text += (
+        f"\nOn {os.cpu_count()} cores. Load: jobs that ran or waited on average in the minute"
+        " before; at more than 0 the clock shows other jobs too.\n"
+    )
+    facts = {(kernels, method): clock for method, kernels, clock, *_ in rows}
+    return text, facts | {"memory": peak}
+
+
+def first(method):
+    """Return rows of a replay with nothing compiled, and of one after it."""
+    with TemporaryDirectory() as cache:
+        return [(method, kernels, *replayed(method, cache)) for kernels in ("none yet", "on disk")]
+
+
+def replayed(method, cache):
+    """Return seconds by the clock, of all processes together, and the load before."""
+    (load, _, _), start, cpu = os.getloadavg(), perf_counter(), children_s()
+    with TemporaryDirectory() as output:
+        run(START, "replay", RECORDING, "-o", output, "--method", method, NUMBA_CACHE_DIR=cache)
+    return perf_counter() - start, children_s() - cpu, load
+
+
+def children_s():
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def memory_mb(views):
+    return [float(number) for number in run(SCAN.format(views=views)).split()]
 
 
 def peak_mb():
@@ -45,14 +74,14 @@ def peak_mb():
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def run(code, **environment):
-    """Run code in a Python of its own; return the numbers it prints."""
+def run(code, *arguments, **environment):
+    """Run code in a Python of its own; return what it prints."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "benchmarks")])
     done = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, *arguments],
         env={**os.environ, "PYTHONPATH": path, **environment},
         capture_output=True,
         text=True,
         check=True,
     )
-    return [float(number) for number in done.stdout.split()]
+    return done.stdout

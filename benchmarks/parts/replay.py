@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 SHARED = ROOT / "../shared/data/recordings"
 
 
-def report(quick, _output):
+def report(quick, _output, kept):
     paths = [ROOT / "recordings/demo_apple.mcap"]
     if not quick:
         paths += [p for name in ("apple_fd2", "oak_fd3") if (p := SHARED / f"{name}.mcap").exists()]
@@ -28,7 +28,11 @@ def report(quick, _output):
         "recording", "views", "voxels", "pieces", "clusters, shared", "obvious ms", "ours ms",
         "ratio", "ours, skeleton after every view",
     )  # fmt: skip
-    text = table("Whole replay at 5 mm", head, [row_of(path) for path in paths])
+    text = table(
+        "Whole replay at 5 mm",
+        head,
+        [kept(f"replay-{path.stem}", lambda path=path: row_of(path)) for path in paths],
+    )
     text += (
         "\nObvious: scipy splines, numpy per bounding box, kd-tree smoothing and forest, explicit"
         " graph, a Dijkstra per piece and round (one timed, the rest extrapolated).\n"

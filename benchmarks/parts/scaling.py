@@ -7,17 +7,27 @@ from parts.updates import STAGES, update
 VOXEL_M = 0.005
 
 
-def report(quick, output):
+def report(quick, output, kept):
+    def median_of(*scene):
+        name = "scaling-" + "-".join(f"{number:g}" for number in scene)
+        return kept(name, lambda: typical(*scene))
+
+    views = 40 if quick else 200
     curves = {
-        "views seen so far": over_views(40 if quick else 200),
+        "views seen so far": dict(
+            enumerate(
+                kept(f"scaling-views-{views}", lambda: over_views(views)),
+                start=1,
+            )
+        ),
         "instances per view": {
-            n: typical(45, 12, n) for n in ((10, 25) if quick else (5, 10, 25, 50, 100))
+            n: median_of(45, 12, n) for n in ((10, 25) if quick else (5, 10, 25, 50, 100))
         },
         "fragments": {
-            n: typical(n, 12, 25) for n in ((20, 100) if quick else (20, 50, 100, 200, 350, 500))
+            n: median_of(n, 12, 25) for n in ((20, 100) if quick else (20, 50, 100, 200, 350, 500))
         },
         "volume and wood, times": {
-            n: typical(45 * n, 6 * n, 25, 2.0 * n ** (1 / 3), 66.0 * n)
+            n: median_of(45 * n, 6 * n, 25, 2.0 * n ** (1 / 3), 66.0 * n)
             for n in ((1, 2) if quick else (1, 2, 4, 8, 16))
         },
     }
@@ -36,10 +46,8 @@ def report(quick, output):
 
 
 def over_views(views):
-    engine, curve = Engine(VOXEL_M), {}
-    for number, clusters in enumerate(clusters_of_views(45, views), start=1):
-        curve[number] = update(engine, clusters)[0]
-    return curve
+    engine = Engine(VOXEL_M)
+    return [update(engine, clusters)[0] for clusters in clusters_of_views(45, views)]
 
 
 def typical(*scene):

@@ -24,10 +24,12 @@ FRAGMENTS = 45
 HEAD = ("stage", "obvious ms", "ours ms", "ratio", "floor ms", "floor is")
 
 
-def report(quick, _output):
+def report(quick, _output, kept):
     texts, facts = [], {}
     for voxel_mm in (10, 5) if quick else (10, 5, 2.5):
-        text, rows = at_voxel_size(voxel_mm / 1000, 70 if voxel_mm > 4 and not quick else 20)
+        views = 20 if quick else 70
+        name = f"stages-{voxel_mm}mm-{views}"
+        text, rows = kept(name, lambda mm=voxel_mm, n=views: at_voxel_size(mm / 1000, n))
         texts.append(text)
         for name, slow, fast, *_ in rows:
             if slow:

@@ -11,12 +11,13 @@ from canopy_skel.spline import fit_splines
 STAGES = ("clusters", "fit", "map", "strands", "initial", "repair", "preview", "joins", "paths")
 
 
-def report(quick, _output):
+def report(quick, _output, kept):
     rows, facts = [], {}
     for voxel_mm in (10, 5) if quick else (10, 5, 2.5):
         for fragments in (45, 300):
-            views = 20 if quick or voxel_mm < 4 else 70
-            row, found = row_of(voxel_mm / 1000, fragments, views)
+            scene = (voxel_mm / 1000, fragments, 20 if quick else 70)
+            name = f"updates-{voxel_mm}mm-{fragments}-{scene[-1]}"
+            row, found = kept(name, lambda scene=scene: row_of(*scene))
             rows.append(row)
             facts |= {(name, voxel_mm, fragments): value for name, value in found.items()}
     head = ("mm", "fragments seen", "views", *STAGES, "**all**", "all, most", "scratch / repair")

@@ -3,16 +3,22 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.fuse import Floats, Ints, cell_key
+from canopy_skel.kernels.cells import cell_key, first_at
+from canopy_skel.kernels.compiled import kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 AGREEMENT = 3
 """Columns: beside any point of the other view, along an instance's, along a fragment's."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(
+    "int64[:,::1](float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], boolean[::1],"
+    " int64[::1], float64, float64, float64, float64)"
+)
 def agreement(
     points: Floats,
     directions: Floats,
@@ -33,8 +39,8 @@ def agreement(
     """
     found = np.zeros((len(points), AGREEMENT), dtype=np.int64)
     for i in range(len(points)):
-        px, py, pz = points[i]
-        dx, dy, dz = directions[i]
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         for x in range(
             math.floor((px - reach_m) / cell_m), math.floor((px + reach_m) / cell_m) + 1
         ):
@@ -43,7 +49,7 @@ def agreement(
             ):
                 low = cell_key(x, y, math.floor((pz - reach_m) / cell_m))
                 high = cell_key(x, y, math.floor((pz + reach_m) / cell_m))
-                j = np.searchsorted(keys, low)
+                j = first_at(keys, low)
                 while j < len(keys) and keys[j] <= high:
                     wx = references[j, 0] - px
                     wy = references[j, 1] - py
@@ -52,8 +58,10 @@ def agreement(
                     along = wx * dx + wy * dy + wz * dz
                     if squared <= reach_m**2 and squared - along * along <= across_m**2:
                         found[i, 0] = 1
-                        rx, ry, rz = reference_directions[j]
-                        if abs(dx * rx + dy * ry + dz * rz) >= min_cosine:
+                        cosine = dx * reference_directions[j, 0]
+                        cosine += dy * reference_directions[j, 1]
+                        cosine += dz * reference_directions[j, 2]
+                        if abs(cosine) >= min_cosine:
                             found[i, 2 if fragment[j] else 1] = 1
                     j += 1
     return found

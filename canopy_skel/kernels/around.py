@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner, kernel
 
 Floats32 = NDArray[np.float32]
 RINGS_PX = (2, 5, 12, 24)
@@ -18,7 +19,7 @@ the darkest); share of the ring at the same depth, and of two: along; across far
 depth; share under masks, and whether a mask lies along."""
 
 
-@njit(cache=True, nogil=True)
+@inner("int64[:,:,::1](UniTuple(int64, 4))")
 def ring_offsets(rings_px: tuple[int, ...]) -> NDArray[np.int64]:
     """Return (rings, DIRECTIONS, 2): steps down and right to places around a pixel."""
     offsets = np.zeros((len(rings_px), DIRECTIONS, 2), dtype=np.int64)
@@ -30,7 +31,7 @@ def ring_offsets(rings_px: tuple[int, ...]) -> NDArray[np.int64]:
     return offsets
 
 
-@njit(cache=True, nogil=True)
+@inner("int64(float32[:])")
 def best_line(odds: Floats32) -> int:
     """Return the direction whose two sides both look most like wood."""
     best, highest = 0, np.float32(-np.inf)
@@ -41,7 +42,7 @@ def best_line(odds: Floats32) -> int:
     return best
 
 
-@njit(cache=True, nogil=True)
+@inner("void(float32[:,::1], float32, float32, float32[::1])")
 def ring_figures(ring: Floats32, lightness: float, z: float, row: Floats32) -> None:
     """Write what one ring (DIRECTIONS, 4) shows around a pixel into `row` (PER_RING,)."""
     half, quarter = DIRECTIONS // 2, DIRECTIONS // 4
@@ -67,7 +68,10 @@ def ring_figures(ring: Floats32, lightness: float, z: float, row: Floats32) -> N
     row[11] = max(ring[a, 3], ring[b, 3])
 
 
-@njit(cache=True, nogil=True)
+@inner(
+    "void(float32[:,:,::1], float32[:], int64[:], int64[:], int64[:,:,::1], float32[::1],"
+    " float32[:,::1], int64)"
+)
 def pixel_figures(
     layers: Floats32,
     mean_odds: Floats32,
@@ -91,7 +95,7 @@ def pixel_figures(
         ring_figures(ring, lightness, z, row[OWN + r * PER_RING : OWN + (r + 1) * PER_RING])
 
 
-@njit(cache=True, nogil=True)
+@kernel("float32[:,::1](float32[:,:,::1], float32[:], int64[:], int64[:])")
 def figures_around(
     layers: Floats32, mean_odds: Floats32, v: NDArray[np.int64], u: NDArray[np.int64]
 ) -> Floats32:
@@ -106,7 +110,10 @@ def figures_around(
     return rows
 
 
-@njit(cache=True, nogil=True)
+@kernel(
+    "float32[::1](float32[:,:,::1], float32[:], int64[:], int64[:], float32[:,::1], float32[::1],"
+    " float32[::1], float64)"
+)
 def wood_log_odds(
     layers: Floats32,
     mean_odds: Floats32,

@@ -1,8 +1,9 @@
 """What each pixel of an instance knows of the instance's middle line."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import kernel
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -10,7 +11,7 @@ U16 = NDArray[np.uint16]
 F32 = NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
+@kernel("void(uint16[:,::1], float64[:,::1], int64[::1], int64, float32[:,:,::1])")
 def nearest_on_lines(instances: U16, lines: F64, starts: I64, stride: int, out: F32) -> None:
     """Fill out (h, w, 3) with offset from the middle line, its angle and its radius.
 

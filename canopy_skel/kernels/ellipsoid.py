@@ -13,10 +13,10 @@ segment and the voxel alone.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import slot_of
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.grid import RUN, slot_of
 
 Floats = NDArray[np.float64]
 Float32s = NDArray[np.float32]
@@ -25,11 +25,8 @@ Int32s = NDArray[np.int32]
 Line = tuple[float, float, float]
 Shape = tuple[float, float, float, float, float, float, float, float]
 
-RUN = 8
-"""Voxels of a run."""
 
-
-@njit("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64)", cache=True, nogil=True)
+@inner("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64)")
 def box_of(segments: Floats, i: int, reach: float, dimension: int) -> tuple[int, int]:
     """Return [first, end) voxel of segment i's support along x (0), y (1) or z (2)."""
     start, axis = segments[i, dimension], segments[i, 3 + dimension]
@@ -39,7 +36,7 @@ def box_of(segments: Floats, i: int, reach: float, dimension: int) -> tuple[int,
     return math.floor(min(near, far) - margin), math.floor(max(near, far) + margin) + 1
 
 
-@njit("int64[:,::1](float64[:,::1], float64)", cache=True, nogil=True)
+@kernel("int64[:,::1](float64[:,::1], float64)")
 def bounds_of_segments(segments: Floats, reach: float) -> Ints:
     """Return the first and the end block (2, 3) of all supports."""
     span = np.empty((2, 3), dtype=np.int64)
@@ -52,7 +49,7 @@ def bounds_of_segments(segments: Floats, reach: float) -> Ints:
     return span
 
 
-@njit("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64)", cache=True, nogil=True)
+@inner("UniTuple(int64, 2)(float64[:,::1], int64, float64, int64)")
 def strip_of(segments: Floats, i: int, reach: float, x: int) -> tuple[int, int]:
     """Return [first, end) y where the shadow of segment i's cylinder on the xy plane crosses x."""
     first, end = box_of(segments, i, reach, 1)
@@ -65,7 +62,7 @@ def strip_of(segments: Floats, i: int, reach: float, x: int) -> tuple[int, int]:
     return max(first, low), min(end, high)
 
 
-@njit("UniTuple(float64, 8)(float64[:,::1], int64)", error_model="numpy", cache=True, nogil=True)
+@inner("UniTuple(float64, 8)(float64[:,::1], int64)", error_model="numpy")
 def shape_of(segments: Floats, i: int) -> Shape:
     """Return what all rows along a segment share.
 
@@ -87,11 +84,7 @@ def shape_of(segments: Floats, i: int) -> Shape:
     )  # fmt: skip
 
 
-@njit(
-    "UniTuple(float64, 3)(float64[:,::1], int64, UniTuple(float64, 8), int64, int64)",
-    cache=True,
-    nogil=True,
-)
+@inner("UniTuple(float64, 3)(float64[:,::1], int64, UniTuple(float64, 8), int64, int64)")
 def line_of(segments: Floats, i: int, shape: Shape, x: int, y: int) -> Line:
     """Return gap, and slide and place at z = 0, of the row of voxels at x, y."""
     tilt, _, _, per_length, per_radius, per_tilt, _, _ = shape
@@ -105,11 +98,7 @@ def line_of(segments: Floats, i: int, shape: Shape, x: int, y: int) -> Line:
     return gap * gap, (wz * tilt - across * per_tilt * az) * per_radius, place
 
 
-@njit(
-    "UniTuple(int64, 2)(UniTuple(float64, 3), UniTuple(float64, 8), float64)",
-    cache=True,
-    nogil=True,
-)
+@inner("UniTuple(int64, 2)(UniTuple(float64, 3), UniTuple(float64, 8), float64)")
 def reach_of(line: Line, shape: Shape, k: float) -> tuple[int, int]:
     """Return [first, end) z of the voxels of a row that may lie inside the support.
 
@@ -136,7 +125,7 @@ def reach_of(line: Line, shape: Shape, k: float) -> tuple[int, int]:
     return math.ceil(low), math.floor(high) + 1
 
 
-@njit("int64(float64[:,::1], float64)", error_model="numpy", cache=True, nogil=True)
+@kernel("int64(float64[:,::1], float64)", error_model="numpy")
 def room_for(segments: Floats, k: float) -> int:
     """Return how many runs the supports have at most."""
     room = 0
@@ -152,11 +141,9 @@ def room_for(segments: Floats, k: float) -> int:
     return room
 
 
-@njit(
+@kernel(
     "int64(float64[:,::1], float64, int32[:,:,::1], int64[::1], int64, int64[::1], int32[::1],"
-    " float32[:,::1])",
-    cache=True,
-    nogil=True,
+    " float32[:,::1])"
 )
 def runs_of_segments(
     segments: Floats,
@@ -199,11 +186,9 @@ def runs_of_segments(
     return blocks
 
 
-@njit(
+@kernel(
     "int64(float64[:,::1], int32[:,::1], int32[:,:,::1], int64[::1], int64, int64[::1], int32[::1],"
-    " float32[:,::1], int8[::1])",
-    cache=True,
-    nogil=True,
+    " float32[:,::1], int8[::1])"
 )
 def runs_on_segments(
     segments: Floats,
@@ -237,7 +222,7 @@ def runs_on_segments(
     return blocks
 
 
-@njit("int32[:,::1](int32[:,::1], int64)", cache=True, nogil=True)
+@inner("int32[:,::1](int32[:,::1], int64)")
 def resized(rows: Int32s, length: int) -> Int32s:
     """Return a copy of rows with room for `length`, or their first ones.
 
@@ -250,7 +235,7 @@ def resized(rows: Int32s, length: int) -> Int32s:
     return copy
 
 
-@njit("int64(float64[:,::1], int64, int32[:,::1], int64)", cache=True, nogil=True)
+@inner("int64(float64[:,::1], int64, int32[:,::1], int64)")
 def rows_on_segment(segments: Floats, segment: int, rows: Int32s, count: int) -> int:
     """Write a row for each voxel a segment passes through (Amanatides and Woo's traversal).
 
@@ -283,7 +268,7 @@ def rows_on_segment(segments: Floats, segment: int, rows: Int32s, count: int) ->
     return count
 
 
-@njit("int32[:,::1](float64[:,::1])", cache=True, nogil=True)
+@kernel("int32[:,::1](float64[:,::1])")
 def rows_on_segments(segments: Floats) -> Int32s:
     """Return (R, 5) rows of one voxel each: those that the segments pass through, in order."""
     room = 0

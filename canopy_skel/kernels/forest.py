@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import CENTRE, find
-from canopy_skel.kernels.joins import root_of
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.grid import CENTRE, find
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -15,11 +14,9 @@ Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
 
-@njit(
+@kernel(
     "Tuple((int64[:,::1], float64[::1]))(float64[:,::1], int32[:,::1], int32[:,:,::1], int64[::1],"
-    " int32[:,::1])",
-    cache=True,
-    nogil=True,
+    " int32[:,::1])"
 )
 def neighbour_pairs(
     points: Floats, voxels: Int32s, top: Int32s, origin: Ints, slots: Int32s
@@ -42,26 +39,7 @@ def neighbour_pairs(
     return pairs[:count].copy(), length[:count].copy()
 
 
-@njit("int64[:,::1](int64[:,::1], int64)", cache=True, nogil=True)
-def kruskal(pairs: Ints, points: int) -> Ints:
-    """Return the pairs (sorted by length) that a minimum spanning forest takes."""
-    parent = np.arange(points).astype(np.int32)
-    taken = np.empty((len(pairs), 2), dtype=np.int64)
-    count = 0
-    for i in range(len(pairs)):
-        a, b = root_of(parent, pairs[i, 0]), root_of(parent, pairs[i, 1])
-        if a != b:
-            parent[max(a, b)] = min(a, b)
-            taken[count, 0], taken[count, 1] = pairs[i, 0], pairs[i, 1]
-            count += 1
-    return taken[:count].copy()
-
-
-@njit(
-    "int64(int64, int64, int64[::1], int64[::1], uint8[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("int64(int64, int64, int64[::1], int64[::1], uint8[::1])")
 def onward(vertex: int, came_from: int, start: Ints, beside: Ints, alive: Bytes) -> int:
     """Return the living neighbour of a vertex other than the one it was come from, or -1."""
     for i in range(start[vertex], start[vertex + 1]):
@@ -70,11 +48,9 @@ def onward(vertex: int, came_from: int, start: Ints, beside: Ints, alive: Bytes)
     return -1
 
 
-@njit(
+@kernel(
     "Tuple((int64[:,::1], float64[::1]))(float64[:,::1], int64[::1], int64[::1], int64[::1],"
-    " uint8[::1], float64)",
-    cache=True,
-    nogil=True,
+    " uint8[::1], float64)"
 )
 def spurs(
     points: Floats, start: Ints, beside: Ints, degree: Ints, alive: Bytes, longest_m: float
@@ -99,7 +75,7 @@ def spurs(
     return found[:count].copy(), length[:count].copy()
 
 
-@njit("int64(int64[:,::1], int64[::1], int64[::1], int64[::1], uint8[::1])", cache=True, nogil=True)
+@kernel("int64(int64[:,::1], int64[::1], int64[::1], int64[::1], uint8[::1])")
 def cut(found: Ints, start: Ints, beside: Ints, degree: Ints, alive: Bytes) -> int:
     """Cut spurs (sorted) off forks that still are forks; return how many were."""
     done = 0

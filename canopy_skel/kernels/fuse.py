@@ -3,8 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.across import draw
+from canopy_skel.kernels.cells import cell_key, first_at
+from canopy_skel.kernels.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -12,34 +15,28 @@ SUPPORT = 6
 """Columns: total weight, radius, mean p, largest p, views, share of weight from instances."""
 
 
-@njit(cache=True, nogil=True)
-def cell_key(x: int, y: int, z: int) -> int:
-    """Return one number per cell; cells in a row along z follow one another."""
-    return ((x + 1048576) << 42) | ((y + 1048576) << 21) | (z + 1048576)
-
-
-@njit(cache=True, nogil=True)
+@kernel("int64[::1](float64[:,::1], float64)")
 def cell_keys(points: Floats, cell_m: float) -> Ints:
     """Return the number of the cell that each of (N, 3) points lies in."""
     keys = np.zeros(len(points), dtype=np.int64)
     for i in range(len(points)):
-        x, y, z = points[i]
-        keys[i] = cell_key(math.floor(x / cell_m), math.floor(y / cell_m), math.floor(z / cell_m))
+        x, y = math.floor(points[i, 0] / cell_m), math.floor(points[i, 1] / cell_m)
+        keys[i] = cell_key(x, y, math.floor(points[i, 2] / cell_m))
     return keys
 
 
-@njit(cache=True, nogil=True)
+@inner("int64(float64[:,::1], int64, float64, float64[:,::1], int64[::1], float64, int64[::1])")
 def near(
-    point: Floats, reach: float, references: Floats, keys: Ints, cell_m: float, found: Ints
+    points: Floats, i: int, reach: float, references: Floats, keys: Ints, cell_m: float, found: Ints
 ) -> int:
-    """Write which references (R, 3), sorted by the `keys` of their cells, are within reach."""
-    px, py, pz = point
+    """Write which references (R, 3), sorted by `keys` of their cells, point i reaches; how many."""
+    px, py, pz = points[i, 0], points[i, 1], points[i, 2]
     count = 0
     for x in range(math.floor((px - reach) / cell_m), math.floor((px + reach) / cell_m) + 1):
         for y in range(math.floor((py - reach) / cell_m), math.floor((py + reach) / cell_m) + 1):
             low = cell_key(x, y, math.floor((pz - reach) / cell_m))
             high = cell_key(x, y, math.floor((pz + reach) / cell_m))
-            j = np.searchsorted(keys, low)
+            j = first_at(keys, low)
             while j < len(keys) and keys[j] <= high:
                 wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
                 if wx * wx + wy * wy + wz * wz <= reach * reach:
@@ -49,7 +46,7 @@ def near(
     return count
 
 
-@njit(cache=True, nogil=True)
+@inner("int64(int64)")
 def bits_in(number: int) -> int:
     """Return how many bits of a number are set."""
     count = 0
@@ -59,32 +56,11 @@ def bits_in(number: int) -> int:
     return count
 
 
-@njit(cache=True, nogil=True)
-def draw(
-    offset: tuple[float, float, float],
-    heading: tuple[float, float, float],
-    total: float,
-    point: Floats,
-    direction: Floats,
-) -> bool:
-    """Move a point by the mean of offsets, across the mean heading, which becomes its direction.
-
-    False, and nothing is done, where the headings cancel out.
-    """
-    ex, ey, ez = heading
-    norm = math.sqrt(ex * ex + ey * ey + ez * ez)
-    if norm <= 1e-9:
-        return False
-    ex, ey, ez = ex / norm, ey / norm, ez / norm
-    ox, oy, oz = offset[0] / total, offset[1] / total, offset[2] / total
-    along = ox * ex + oy * ey + oz * ez
-    point[0], point[1] = point[0] + ox - along * ex, point[1] + oy - along * ey
-    point[2] = point[2] + oz - along * ez
-    direction[0], direction[1], direction[2] = ex, ey, ez
-    return True
-
-
-@njit(cache=True, nogil=True)
+@kernel(
+    "UniTuple(float64[:,::1], 3)(float64[:,::1], float64[:,::1], float64[::1], float64[:,::1],"
+    " float64[:,::1], float64[::1], float64[::1], float64[::1], int64[::1], boolean[::1],"
+    " int64[::1], float64, float64, float64, float64)"
+)
 def shift_across(
     points: Floats,
     directions: Floats,
@@ -112,32 +88,35 @@ def shift_across(
     moved, turned = points.copy(), directions.copy()
     support, found = np.zeros((len(points), SUPPORT)), np.zeros(len(references), dtype=np.int64)
     for i in range(len(points)):
-        px, py, pz = points[i]
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         width = max(bandwidth_m, radius_share * radii[i])
         total, bits = 0.0, 0
         ox = oy = oz = ex = ey = ez = r = mean_p = masks = largest = 0.0
-        for j in found[: near(points[i], 2.0 * width, references, keys, cell_m, found)]:
-            rx, ry, rz = reference_directions[j]
+        for n in range(near(points, i, 2.0 * width, references, keys, cell_m, found)):
+            j = found[n]
+            rx, ry = reference_directions[j, 0], reference_directions[j, 1]
+            rz = reference_directions[j, 2]
             cosine = directions[i, 0] * rx + directions[i, 1] * ry + directions[i, 2] * rz
             if abs(cosine) < min_cosine:
                 continue
             wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
             weight = weights[j] * math.exp(-0.5 * (wx * wx + wy * wy + wz * wz) / (width * width))
             signed = weight if cosine > 0.0 else -weight
-            total += weight
+            total, masks = total + weight, masks + (0.0 if fragment[j] else weight)
             ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
             ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
-            r += weight * reference_radii[j]
-            mean_p += weight * probability[j]
+            r, mean_p = r + weight * reference_radii[j], mean_p + weight * probability[j]
             largest, bits = max(largest, probability[j]), bits | view_bits[j]
-            masks += 0.0 if fragment[j] else weight
-        if total > 0.0 and draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i]):
-            support[i, :3] = (total, r / total, mean_p / total)
-            support[i, 3:] = (largest, float(bits_in(bits)), masks / total)
+        if draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i]):
+            support[i, 0], support[i, 1], support[i, 2] = total, r / total, mean_p / total
+            support[i, 3], support[i, 4], support[i, 5] = largest, bits_in(bits), masks / total
     return moved, turned, support
 
 
-@njit(cache=True, nogil=True)
+@kernel(
+    "float64[:,:,::1](int64[::1], float64[:,::1], float64[:,::1], float64[::1], int64[::1],"
+    " float64, float64, float64)"
+)
 def spread_around(
     chosen: Ints,
     directions: Floats,
@@ -155,17 +134,23 @@ def spread_around(
     `directions` (R, 3).
     """
     spread, found = np.zeros((len(chosen), 3, 3)), np.zeros(len(references), dtype=np.int64)
-    for c, i in enumerate(chosen):
-        total, mean = 0.0, np.zeros(3)
-        for j in found[: near(references[i], 2 * bandwidth_m, references, keys, cell_m, found)]:
-            way = references[j] - references[i]
-            weight = weights[j] * math.exp(-0.5 * (way * way).sum() / bandwidth_m**2)
-            total += weight
-            mean += weight * way
+    way, mean = np.zeros(3), np.zeros(3)
+    own = own_share * bandwidth_m**2
+    for c in range(len(chosen)):
+        i, total = chosen[c], 0.0
+        for a in range(3):
+            mean[a] = 0.0
+        for n in range(near(references, i, 2 * bandwidth_m, references, keys, cell_m, found)):
+            squared = 0.0
             for a in range(3):
+                way[a] = references[found[n], a] - references[i, a]
+                squared += way[a] * way[a]
+            weight = weights[found[n]] * math.exp(-0.5 * squared / bandwidth_m**2)
+            total += weight
+            for a in range(3):
+                mean[a] += weight * way[a]
                 for b in range(3):
                     spread[c, a, b] += weight * way[a] * way[b]
-        own = own_share * bandwidth_m**2
         for a in range(3):
             for b in range(3):
                 square = spread[c, a, b] - mean[a] * mean[b] / total
@@ -173,14 +158,14 @@ def spread_around(
     return spread
 
 
-@njit(cache=True, nogil=True)
+@kernel("boolean[::1](int64[::1], int64[::1], int64[::1])")
 def thinned(order: Ints, start: Ints, neighbours: Ints) -> NDArray[np.bool_]:
     """Keep, in this order, each point none of whose neighbours is kept already."""
     kept = np.zeros(len(order), dtype=np.bool_)
-    for i in order:
-        free = True
-        for j in neighbours[start[i] : start[i + 1]]:
-            if kept[j]:
+    for n in range(len(order)):
+        i, free = order[n], True
+        for k in range(start[i], start[i + 1]):
+            if kept[neighbours[k]]:
                 free = False
                 break
         kept[i] = free

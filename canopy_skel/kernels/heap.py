@@ -5,13 +5,14 @@ tuples. Room must be there: nothing is returned, so nothing is counted reference
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner
 
 Ints = NDArray[np.int64]
 
 
-@njit("void(int64[::1], int64)", cache=True, nogil=True)
+@inner("void(int64[::1], int64)")
 def push(heap: Ints, entry: int) -> None:
     """Add a number."""
     at = heap[0] + 1
@@ -22,7 +23,7 @@ def push(heap: Ints, entry: int) -> None:
     heap[at] = entry
 
 
-@njit("void(int64[::1])", cache=True, nogil=True)
+@inner("void(int64[::1])")
 def pop(heap: Ints) -> None:
     """Take the least number away."""
     count = heap[0] - 1
@@ -38,7 +39,7 @@ def pop(heap: Ints) -> None:
     heap[at] = last
 
 
-@njit("boolean(int64[:,::1], int64, int64, int64, int64)", cache=True, nogil=True)
+@inner("boolean(int64[:,::1], int64, int64, int64, int64)")
 def is_before(heap: Ints, i: int, a: int, b: int, c: int) -> bool:
     """Say whether row i comes before (a, b, c)."""
     if heap[i, 0] != a:
@@ -48,7 +49,7 @@ def is_before(heap: Ints, i: int, a: int, b: int, c: int) -> bool:
     return bool(heap[i, 2] < c)
 
 
-@njit("void(int64[:,::1], int64, int64, int64)", cache=True, nogil=True)
+@inner("void(int64[:,::1], int64, int64, int64)")
 def push_row(heap: Ints, a: int, b: int, c: int) -> None:
     """Add the row (a, b, c)."""
     at = heap[0, 0] + 1
@@ -60,7 +61,7 @@ def push_row(heap: Ints, a: int, b: int, c: int) -> None:
     heap[at, 0], heap[at, 1], heap[at, 2] = a, b, c
 
 
-@njit("void(int64[:,::1])", cache=True, nogil=True)
+@inner("void(int64[:,::1])")
 def pop_row(heap: Ints) -> None:
     """Take the least row away."""
     count = heap[0, 0] - 1
@@ -80,7 +81,7 @@ def pop_row(heap: Ints) -> None:
     heap[at, 0], heap[at, 1], heap[at, 2] = a, b, c
 
 
-@njit("int64[:,::1](int64[:,::1], int64)", cache=True, nogil=True)
+@inner("int64[:,::1](int64[:,::1], int64)")
 def with_room(heap: Ints, more: int) -> Ints:
     """Return a heap of rows with room for more, a copy if it had none."""
     count = heap[0, 0] + 1

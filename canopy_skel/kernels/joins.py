@@ -5,12 +5,13 @@ two ends and itself. It is written as slot * 32 + direction, from the lower to t
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import CENTRE, SLOTS, beside, key_of
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.grid import CENTRE, SLOTS
 from canopy_skel.kernels.heap import pop, pop_row, push, push_row, with_room
-from canopy_skel.kernels.search import COSTS, LENGTHS, UNREACHED
+from canopy_skel.kernels.steps import COSTS, LENGTHS, UNREACHED, beside, key_of
+from canopy_skel.kernels.unions import root_of
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -23,7 +24,7 @@ FOREST = (
 )
 
 
-@njit("int64[::1](int64[::1], int64)", cache=True, nogil=True)
+@inner("int64[::1](int64[::1], int64)")
 def resized_long(entries: Ints, length: int) -> Ints:
     """Return a copy with room for `length` entries, or of the first ones."""
     copy = np.empty(length, dtype=np.int64)
@@ -32,7 +33,7 @@ def resized_long(entries: Ints, length: int) -> Ints:
     return copy
 
 
-@njit("int64[::1](int64[::1], int64[::1])", cache=True, nogil=True)
+@inner("int64[::1](int64[::1], int64[::1])")
 def joined(entries: Ints, more: Ints) -> Ints:
     """Return both, one after the other."""
     both = resized_long(entries, len(entries) + len(more))
@@ -41,19 +42,8 @@ def joined(entries: Ints, more: Ints) -> Ints:
     return both
 
 
-@njit("int64(int32[::1], int64)", cache=True, nogil=True)
-def root_of(parent: Int32s, label: int) -> int:
-    """Return the representative of a component, shortening the way to it."""
-    while parent[label] != label:
-        parent[label] = parent[parent[label]]
-        label = int(parent[label])
-    return label
-
-
-@njit(
-    "Tuple((int64[::1], int64[::1]))(int64[::1], uint8[::1], int32[:,::1], int32[::1], int32[::1])",
-    cache=True,
-    nogil=True,
+@kernel(
+    "Tuple((int64[::1], int64[::1]))(int64[::1], uint8[::1], int32[:,::1], int32[::1], int32[::1])"
 )
 def borders_of(
     chosen: Ints,
@@ -103,7 +93,7 @@ def borders_of(
     return resized_long(edges, total), resized_long(costs, total)
 
 
-@njit("int64[:,::1](int64[::1], int32[:,::1], int32[:,::1], int32[::1])", cache=True, nogil=True)
+@kernel("int64[:,::1](int64[::1], int32[:,::1], int32[:,::1], int32[::1])")
 def ends_of(edges: Ints, neighbours: Int32s, places: Int32s, label: Int32s) -> Ints:
     """Return (N, 3): an ordering key of each border's lower voxel, and the labels of both ends."""
     ends = np.empty((len(edges), 3), dtype=np.int64)
@@ -115,21 +105,7 @@ def ends_of(edges: Ints, neighbours: Int32s, places: Int32s, label: Int32s) -> I
     return ends
 
 
-@njit("int64[::1](int64[:,::1], int32[::1])", cache=True, nogil=True)
-def span(ends: Ints, parent: Int32s) -> Ints:
-    """Return which borders (sorted by cost) a minimum spanning tree of the labels takes."""
-    taken = np.empty(len(ends), dtype=np.int64)
-    count = 0
-    for i in range(len(ends)):
-        a, b = root_of(parent, ends[i, 1]), root_of(parent, ends[i, 2])
-        if a != b:
-            parent[max(a, b)] = min(a, b)
-            taken[count] = i
-            count += 1
-    return resized_long(taken, count)
-
-
-@njit("int64[::1](int64, int32[:,::1], uint8[::1])", cache=True, nogil=True)
+@kernel("int64[::1](int64, int32[:,::1], uint8[::1])")
 def trace(edge: int, neighbours: Int32s, previous: Bytes) -> Ints:
     """Return the slots of the way over a border, from source to source, the lower voxel's first."""
     path = np.empty(64, dtype=np.int64)
@@ -156,11 +132,7 @@ def trace(edge: int, neighbours: Int32s, previous: Bytes) -> Ints:
     return resized_long(path, count)
 
 
-@njit(
-    "int64(int64, int64, int32[:,::1], int32[::1], uint8[::1], int32[::1], uint8[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("int64(int64, int64, int32[:,::1], int32[::1], uint8[::1], int32[::1], uint8[::1])")
 def note(
     slot: int,
     count: int,
@@ -179,7 +151,7 @@ def note(
     return count + 1
 
 
-@njit("int32[:,::1](int32[:,::1], int64)", cache=True, nogil=True)
+@inner("int32[:,::1](int32[:,::1], int64)")
 def longer(journal: Int32s, length: int) -> Int32s:
     """Return a journal (N, 4) with room for `length` entries, a copy if it had none."""
     if length <= len(journal):
@@ -191,11 +163,7 @@ def longer(journal: Int32s, length: int) -> Int32s:
     return copy
 
 
-@njit(
-    "void(int32[:,::1], int64, int32[::1], uint8[::1], int32[::1], uint8[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("void(int32[:,::1], int64, int32[::1], uint8[::1], int32[::1], uint8[::1])")
 def roll_back(
     journal: Int32s,
     count: int,
@@ -211,11 +179,7 @@ def roll_back(
         label[slot], marks[slot] = journal[i, 3], 0
 
 
-@njit(
-    f"int64(int64, int64[::1], int64[:,::1], int32[:,::1], int64, int32[::1], {FOREST})",
-    cache=True,
-    nogil=True,
-)
+@inner(f"int64(int64, int64[::1], int64[:,::1], int32[:,::1], int64, int32[::1], {FOREST})")
 def spread(
     u: int,
     pending: Ints,
@@ -255,7 +219,7 @@ def spread(
     return noted
 
 
-@njit(f"UniTuple(int64, 2)(int64, int64, int32[::1], {FOREST})", cache=True, nogil=True)
+@inner(f"UniTuple(int64, 2)(int64, int64, int32[::1], {FOREST})")
 def joined_by(edge: int, total: int, parent: Int32s, forest: Forest) -> tuple[int, int]:
     """Return the two components that a border joins, twice the same if it costs this no more."""
     levels, neighbours, _, distance, _, label, _ = forest
@@ -266,11 +230,7 @@ def joined_by(edge: int, total: int, parent: Int32s, forest: Forest) -> tuple[in
     return (a, b) if total == int(distance[u]) + step + int(distance[v]) else (a, a)
 
 
-@njit(
-    f"int64(int64[::1], int64, int64[::1], int32[:,::1], int64, {FOREST})",
-    cache=True,
-    nogil=True,
-)
+@inner(f"int64(int64[::1], int64, int64[::1], int32[:,::1], int64, {FOREST})")
 def make_wood(
     path: Ints, of: int, pending: Ints, journal: Int32s, noted: int, forest: Forest
 ) -> int:
@@ -286,7 +246,7 @@ def make_wood(
     return noted
 
 
-@njit("int64[:,::1](int64[::1], int64[::1], int64[:,::1])", cache=True, nogil=True)
+@inner("int64[:,::1](int64[::1], int64[::1], int64[:,::1])")
 def heap_of(edges: Ints, costs: Ints, ends: Ints) -> Ints:
     """Return borders in canonical order as a heap, which they already are."""
     heap = np.empty((2 * len(edges) + 64, 3), dtype=np.int64)
@@ -296,11 +256,9 @@ def heap_of(edges: Ints, costs: Ints, ends: Ints) -> Ints:
     return heap
 
 
-@njit(
+@kernel(
     "Tuple((int64[::1], int64[::1], int64[::1], int64))"
-    f"(int64[::1], int64[::1], int64[:,::1], int32[::1], int64, {FOREST})",
-    cache=True,
-    nogil=True,
+    f"(int64[::1], int64[::1], int64[:,::1], int32[::1], int64, {FOREST})"
 )
 def join_all(
     edges: Ints, costs: Ints, ends: Ints, parent: Int32s, joins: int, forest: Forest

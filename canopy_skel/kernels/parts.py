@@ -6,18 +6,18 @@ Points lie in groups one after the other: those of group i are start[i] up to st
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.fit import diagonalise, scatter_of
-from canopy_skel.kernels.trust import median_of
+from canopy_skel.kernels.axes import diagonalise, scatter_of
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.median import median_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
 
-@njit("int64(float64[:,::1], int64, int64, float64, int64[:,::1])", cache=True, nogil=True)
+@inner("int64(float64[:,::1], int64, int64, float64, int64[:,::1])")
 def cells_of(points: Floats, first: int, end: int, cell_m: float, cells: Ints) -> int:
     """Write the cells (3,) of points [first, end), from their lowest corner on.
 
@@ -37,7 +37,7 @@ def cells_of(points: Floats, first: int, end: int, cell_m: float, cells: Ints) -
     return total
 
 
-@njit("void(int32[::1], int64[::1], int64, int64, int32[::1])", cache=True, nogil=True)
+@inner("void(int32[::1], int64[::1], int64, int64, int32[::1])")
 def flood(grid: Int32s, shape: Ints, cell: int, number: int, stack: Int32s) -> None:
     """Give a cell (-1) and all that touch it, by a corner at least, their number."""
     grid[cell], stack[0], count = number, cell, 1
@@ -54,9 +54,7 @@ def flood(grid: Int32s, shape: Ints, cell: int, number: int, stack: Int32s) -> N
                         count += 1
 
 
-@njit(
-    "Tuple((int64[::1], int64[::1]))(float64[:,::1], int64[::1], float64)", cache=True, nogil=True
-)
+@kernel("Tuple((int64[::1], int64[::1]))(float64[:,::1], int64[::1], float64)")
 def parts_of(points: Floats, start: Ints, cell_m: float) -> tuple[Ints, Ints]:
     """Split groups of points (N, 3) into parts that touch in cells of this size.
 
@@ -86,7 +84,7 @@ def parts_of(points: Floats, start: Ints, cell_m: float) -> tuple[Ints, Ints]:
     return part, group[:parts].copy()
 
 
-@njit("float64[:,::1](float64[:,::1], int64[::1])", cache=True, nogil=True)
+@kernel("float64[:,::1](float64[:,::1], int64[::1])")
 def shapes_of(points: Floats, start: Ints) -> Floats:
     """Return per group (G, 2): second over first principal deviation, and the median of z.
 

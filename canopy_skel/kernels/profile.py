@@ -3,17 +3,22 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.median import median_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 MAX_KNOTS = 8
 QUALITY = 6
 """Columns: pixels, length_px, width_px, valid share, inlier share, lateral deviation / width."""
+DRAWS = 60
+ROUNDS = 6
+"""Of reweighted least squares."""
 
 
-@njit(cache=True, nogil=True)
+@inner("Tuple((int64, float64))(float64, int64)")
 def hats(x: float, count: int) -> tuple[int, float]:
     """Return the knot left of x in [0, 1] and the weight of the one right of it."""
     place = min(max(x, 0.0), 1.0) * (count - 1)
@@ -21,51 +26,90 @@ def hats(x: float, count: int) -> tuple[int, float]:
     return left, place - left
 
 
-@njit(cache=True, nogil=True)
+@inner("float64(float64[::1], float64)")
+def at(values: Floats, x: float) -> float:
+    """Return the value at x of the polyline with these values at its knots."""
+    left, b = hats(x, len(values))
+    return float((1.0 - b) * values[left] + b * values[left + 1])
+
+
+@inner("void(float64[:,::1], float64[::1])")
+def solve_banded(matrix: Floats, right: Floats) -> None:
+    """Solve a positive definite system in place; matrix (n, 3): diagonal, first, second above it.
+
+    LDL' without square roots.
+    """
+    n = len(right)
+    for i in range(n):
+        for below in range(1, min(3, n - i)):
+            factor = matrix[i, below] / matrix[i, 0]
+            for j in range(below, min(3, n - i)):
+                matrix[i + below, j - below] -= factor * matrix[i, j]
+            right[i + below] -= factor * right[i]
+    for back in range(n):
+        i = n - 1 - back
+        for above in range(1, min(3, n - i)):
+            right[i] -= matrix[i, above] * right[i + above]
+        right[i] /= matrix[i, 0]
+
+
+@inner(
+    "void(float64[::1], float64[::1], float64[::1], float64, float64[::1], float64, float64[::1])"
+)
 def fit_hats(
-    x: Floats, y: Floats, weight: Floats, count: int, bend: float, prior: Floats, pull: float
-) -> Floats:
-    """Return the values (count,) at uniform knots of the weighted least-squares polyline.
+    x: Floats, y: Floats, weight: Floats, bend: float, prior: Floats, pull: float, values: Floats
+) -> None:
+    """Write the values at uniform knots of the weighted least-squares polyline.
 
     `bend` weighs squared second differences, `pull` squared distances from `prior`; both times
     the points per knot.
     """
-    normal = np.zeros((count, count))
-    right = np.zeros(count)
+    count = len(values)
+    normal, share = np.zeros((count, 3)), len(x) / count
+    for k in range(count):
+        values[k] = 0.0
     for i in range(len(x)):
         left, b = hats(x[i], count)
         a, w = 1.0 - b, weight[i]
-        normal[left, left] += w * a * a
-        normal[left, left + 1] += w * a * b
-        normal[left + 1, left] += w * a * b
-        normal[left + 1, left + 1] += w * b * b
-        right[left] += w * a * y[i]
-        right[left + 1] += w * b * y[i]
-    share = len(x) / count
+        normal[left, 0] += w * a * a
+        normal[left, 1] += w * a * b
+        normal[left + 1, 0] += w * b * b
+        values[left] += w * a * y[i]
+        values[left + 1] += w * b * y[i]
     for k in range(count):
-        normal[k, k] += pull * share + 1e-9
-        right[k] += pull * share * prior[k] + 1e-9 * prior[k]
+        normal[k, 0] += pull * share + 1e-9
+        values[k] += pull * share * prior[k] + 1e-9 * prior[k]
     for k in range(1, count - 1):
-        for i, p in ((k - 1, 1.0), (k, -2.0), (k + 1, 1.0)):
-            for j, q in ((k - 1, 1.0), (k, -2.0), (k + 1, 1.0)):
-                normal[i, j] += bend * share * p * q
-    return np.linalg.solve(normal, right).astype(np.float64)
+        normal[k - 1, 0] += bend * share
+        normal[k - 1, 1] -= 2.0 * bend * share
+        normal[k - 1, 2] += bend * share
+        normal[k, 0] += 4.0 * bend * share
+        normal[k, 1] -= 2.0 * bend * share
+        normal[k + 1, 0] += bend * share
+    solve_banded(normal, values)
 
 
-@njit(cache=True, nogil=True)
+@inner("float64(float64, float64)")
+def tolerance_at(disparity: float, tolerance_m: float) -> float:
+    """Return what a tolerance in depth is in disparity (1/m); constant beyond 1.25 m."""
+    near = max(disparity, 0.8)
+    return tolerance_m * (near * near)
+
+
+@inner("UniTuple(float64, 2)(float64[::1], float64[::1], float64, float64, float64)")
 def best_line(
-    x: Floats, d: Floats, steepest: float, draws: int, tolerance_m: float
+    x: Floats, d: Floats, middle: float, steepest: float, tolerance_m: float
 ) -> tuple[float, float]:
     """Return disparity at x = 0 and its slope of the line through two points that fits best.
 
-    Misfits count up to the tolerance (truncated L1); a large region is judged by every n-th point.
+    Or of the level one through the median, `middle`. Misfits count up to the tolerance (truncated
+    L1); a large region is judged by every n-th point.
     """
     n = len(x)
     step = max(1, n // 256)
     state = 12345
-    middle = float(np.median(d))
-    best_0, best_slope, best_misfit = middle, 0.0, np.inf
-    for draw in range(draws + 1):
+    best_0, best_slope, best_misfit = middle, 0.0, math.inf
+    for draw in range(DRAWS + 1):
         at_0, slope = middle, 0.0
         if draw > 0:
             state = (state * 1103515245 + 12345) % 2147483648
@@ -82,67 +126,116 @@ def best_line(
         misfit = 0.0
         for k in range(0, n, step):
             line = at_0 + slope * x[k]
-            tolerance = tolerance_m * max(line, 0.8) ** 2
-            misfit += min(abs(d[k] - line) / tolerance, 1.0)
+            misfit += min(abs(d[k] - line) / tolerance_at(line, tolerance_m), 1.0)
         if misfit < best_misfit:
             best_0, best_slope, best_misfit = at_0, slope, misfit
     return best_0, best_slope
 
 
-@njit(cache=True, nogil=True)
+@inner("UniTuple(float64, 4)(float64[::1], float64[::1])")
 def principal_axis(u: Floats, v: Floats) -> tuple[float, float, float, float]:
     """Return the mean (2) and the unit axis (2) of largest spread; its larger part is positive."""
-    mu, mv = u.mean(), v.mean()
-    uu = ((u - mu) ** 2).mean()
-    vv = ((v - mv) ** 2).mean()
-    uv = ((u - mu) * (v - mv)).mean()
-    angle = 0.5 * math.atan2(2.0 * uv, uu - vv)
+    n = len(u)
+    mu = mv = uu = uv = vv = 0.0
+    for i in range(n):
+        mu, mv = mu + u[i], mv + v[i]
+    mu, mv = mu / n, mv / n
+    for i in range(n):
+        du, dv = u[i] - mu, v[i] - mv
+        uu, uv, vv = uu + du * du, uv + du * dv, vv + dv * dv
+    angle = 0.5 * math.atan2(2.0 * (uv / n), uu / n - vv / n)
     return mu, mv, math.cos(angle), math.sin(angle)
 
 
-@njit(cache=True, nogil=True)
-def squares_off(x: Floats, y: Floats, values: Floats) -> float:
-    """Return the sum of squared deviations of points from a polyline."""
-    squares = 0.0
-    for i in range(len(x)):
-        left, b = hats(x[i], len(values))
-        squares += (y[i] - (1.0 - b) * values[left] - b * values[left + 1]) ** 2
-    return squares
-
-
-@njit(cache=True, nogil=True)
-def fit_disparity(x: Floats, d: Floats, count: int, steepest: float, tolerance_m: float) -> Floats:
-    """Return the robust profile (count,) of disparity d at x in [0, 1]: a line, then reweighted."""
-    at_0, slope = best_line(x, d, steepest, 60, tolerance_m)
-    line = np.zeros(count)
+@inner("void(float64[::1], float64[::1], float64, float64, float64, float64[::1])")
+def fit_disparity(
+    x: Floats, d: Floats, f_px: float, span_px: float, tolerance_m: float, values: Floats
+) -> None:
+    """Write the robust profile of disparity d at x in [0, 1]: a line, then reweighted."""
+    count, n = len(values), len(x)
+    weight, line = np.empty(n), np.empty(count)
+    for i in range(n):
+        weight[i] = d[i]
+    middle = median_of(weight)
+    at_0, slope = best_line(x, d, middle, 4.0 * middle / f_px * span_px, tolerance_m)
     for k in range(count):
         line[k] = max(at_0 + slope * k / (count - 1), 1e-3)
-    values = line.copy()
-    weight = np.zeros(len(x))
-    for _ in range(6):
-        for i in range(len(x)):
-            left, b = hats(x[i], count)
-            fit = (1.0 - b) * values[left] + b * values[left + 1]
-            r = abs(d[i] - fit) / (tolerance_m * max(fit, 0.8) ** 2)
-            weight[i] = (1.0 - r * r) ** 2 if r < 1.0 else 0.0
-        values = fit_hats(x, d, weight, count, 0.1, line, 0.01)
-    return values
+        values[k] = line[k]
+    for _ in range(ROUNDS):
+        for i in range(n):
+            fit = at(values, x[i])
+            r = abs(d[i] - fit) / tolerance_at(fit, tolerance_m)
+            weight[i] = (1.0 - r * r) * (1.0 - r * r) if r < 1.0 else 0.0
+        fit_hats(x, d, weight, 0.1, line, 0.01, values)
 
 
-@njit(cache=True, nogil=True)
+@inner("Tuple((int64, float64, float64))(float64[::1], float64[::1], float64[::1], float64)")
 def reached(x: Floats, d: Floats, values: Floats, tolerance_m: float) -> tuple[int, float, float]:
     """Return how many points lie on a profile, and the first and last place of them."""
     inliers, first, last = 0, 2.0, -1.0
     for i in range(len(x)):
-        left, b = hats(x[i], len(values))
-        fit = (1.0 - b) * values[left] + b * values[left + 1]
-        if abs(d[i] - fit) <= tolerance_m * max(fit, 0.8) ** 2:
+        fit = at(values, x[i])
+        if abs(d[i] - fit) <= tolerance_at(fit, tolerance_m):
             inliers += 1
             first, last = min(first, x[i]), max(last, x[i])
     return inliers, first, last
 
 
-@njit(cache=True, nogil=True)
+@inner(
+    "UniTuple(float64, 2)(float64[::1], float64[::1], UniTuple(float64, 4), float64[::1],"
+    " float64[::1])"
+)
+def straightened(
+    u: Floats, v: Floats, axis: tuple[float, float, float, float], x: Floats, aside: Floats
+) -> tuple[float, float]:
+    """Write where pixels lie along an axis (mean, direction), 0 to 1, and how far aside of it.
+
+    Returns the first place along it and the span of all, in pixels.
+    """
+    mu, mv, au, av = axis
+    low, high = math.inf, -math.inf
+    for i in range(len(u)):
+        x[i] = (u[i] - mu) * au + (v[i] - mv) * av
+        aside[i] = (v[i] - mv) * au - (u[i] - mu) * av
+        low, high = min(low, x[i]), max(high, x[i])
+    span = max(high - low, 1.0)
+    for i in range(len(u)):
+        x[i] = (x[i] - low) / span
+    return low, span
+
+
+@inner("float64(float64[::1], float64[::1], float64[::1])")
+def fit_aside(x: Floats, aside: Floats, lateral: Floats) -> float:
+    """Write the polyline through points; return their root mean squared deviation from it."""
+    weight, flat = np.empty(len(x)), np.empty(len(lateral))
+    for i in range(len(x)):
+        weight[i] = 1.0
+    for k in range(len(lateral)):
+        flat[k] = 0.0
+    fit_hats(x, aside, weight, 0.2, flat, 0.002, lateral)
+    squares = 0.0
+    for i in range(len(x)):
+        left, b = hats(x[i], len(lateral))
+        off = aside[i] - (1.0 - b) * lateral[left] - b * lateral[left + 1]
+        squares += off * off
+    return math.sqrt(squares / len(x))
+
+
+@inner("int64(float64[::1], float64[::1], float64[::1])")
+def seen(z: Floats, x: Floats, d: Floats) -> int:
+    """Move places that have depth to the front, write their disparity; return how many have."""
+    valid = 0
+    for i in range(len(z)):
+        if math.isfinite(z[i]):
+            x[valid], d[valid] = x[i], 1.0 / z[i]
+            valid += 1
+    return valid
+
+
+@inner(
+    "int64(float64[::1], float64[::1], float64[::1], float64, float64, int64, float64, float64,"
+    " float64[:,::1], float64[::1])"
+)
 def fit_region(
     u: Floats,
     v: Floats,
@@ -152,50 +245,50 @@ def fit_region(
     max_knots: int,
     tolerance_m: float,
     min_valid: float,
-) -> tuple[int, Floats, Floats]:
+    knots: Floats,
+    quality: Floats,
+) -> int:
     """Fit one region of N pixels (u, v) with depth z (NaN where there is none).
 
-    Returns the number of knots (0: too little depth), rows (u, v, disparity) per knot, quality.
+    Writes rows (u, v, disparity) per knot and the quality; returns the number of knots, 0 where
+    there is too little depth.
     """
     n = len(u)
-    knots = np.zeros((MAX_KNOTS, 3))
-    quality = np.zeros(QUALITY)
     if n == 0:
-        return 0, knots, quality
-    mu, mv, au, av = principal_axis(u, v)
-    s = (u - mu) * au + (v - mv) * av
-    q = (v - mv) * au - (u - mu) * av
-    low, high = s.min(), s.max()
-    span = max(high - low, 1.0)
+        return 0
+    x, d = np.empty(n), np.empty(n)
+    axis = principal_axis(u, v)
+    low, span = straightened(u, v, axis, x, d)
     count = min(max(int(span / knot_px + 0.5) + 1, 2), max_knots)
-    x = (s - low) / span
-    lateral = fit_hats(x, q, np.ones(n), count, 0.2, np.zeros(count), 0.002)
-    spread = squares_off(x, q, lateral)
-    width = n / (span + 1.0)
-    good, valid = np.isfinite(z), int(np.isfinite(z).sum())
-    quality[0], quality[1], quality[2] = n, span + 1.0, width
-    quality[3], quality[5] = valid / n, math.sqrt(spread / n) / width
+    lateral, values = np.empty(count), np.empty(count)
+    quality[0], quality[1], quality[2] = n, span + 1.0, n / (span + 1.0)
+    quality[5] = fit_aside(x, d, lateral) / quality[2]
+    valid = seen(z, x, d)
+    quality[3] = valid / n
     if valid < 3 or valid < min_valid * n:
-        return 0, knots, quality
-    xd, d = x[good], 1.0 / z[good]
-    steepest = 4.0 * float(np.median(d)) / f_px * span
-    values = fit_disparity(xd, d, count, steepest, tolerance_m)
-    inliers, first, last = reached(xd, d, values, tolerance_m)
+        return 0
+    fit_disparity(x[:valid], d[:valid], f_px, span, tolerance_m, values)
+    inliers, first, last = reached(x[:valid], d[:valid], values, tolerance_m)
     quality[4] = inliers / valid
-    if inliers < 3 or values.min() <= 0.05:
-        return 0, knots, quality
+    least = math.inf
     for k in range(count):
-        at = first + (last - first) * k / (count - 1)
-        left, b = hats(at, count)
-        here = low + at * span
-        side = (1.0 - b) * lateral[left] + b * lateral[left + 1]
+        least = min(least, values[k])
+    if inliers < 3 or least <= 0.05:
+        return 0
+    mu, mv, au, av = axis
+    for k in range(count):
+        place = first + (last - first) * k / (count - 1)
+        here, side = low + place * span, at(lateral, place)
         knots[k, 0] = mu + here * au - side * av
         knots[k, 1] = mv + here * av + side * au
-        knots[k, 2] = (1.0 - b) * values[left] + b * values[left + 1]
-    return count, knots, quality
+        knots[k, 2] = at(values, place)
+    return count
 
 
-@njit(cache=True, nogil=True)
+@kernel(
+    "Tuple((int64[::1], float64[:,:,::1], float64[:,::1]))(float64[::1], float64[::1],"
+    " float64[::1], int64[::1], float64, float64, int64, float64, float64)"
+)
 def fit_regions(
     u: Floats,
     v: Floats,
@@ -217,13 +310,14 @@ def fit_regions(
     quality = np.zeros((regions, QUALITY))
     for i in range(regions):
         a, b = start[i], start[i + 1]
-        counts[i], knots[i], quality[i] = fit_region(
-            u[a:b], v[a:b], z[a:b], f_px, knot_px, max_knots, tolerance_m, min_valid
-        )
+        counts[i] = fit_region(
+            u[a:b], v[a:b], z[a:b], f_px, knot_px, max_knots, tolerance_m, min_valid,
+            knots[i], quality[i],
+        )  # fmt: skip
     return counts, knots, quality
 
 
-@njit(cache=True, nogil=True)
+@kernel("void(float64[:,:,::1], int64[::1], float64[::1])")
 def shift_away(points: Floats, counts: Ints, shift_m: Floats) -> None:
     """Move the knots (R, MAX_KNOTS, 3) of R lines, the first counts[i] of each, away from the eye.
 
@@ -241,7 +335,7 @@ def shift_away(points: Floats, counts: Ints, shift_m: Floats) -> None:
                 points[i, k] += shift_m[i] / norm * across
 
 
-@njit(cache=True, nogil=True)
+@kernel("Tuple((float64[:,::1], float64[:,::1], int64[::1]))(float64[:,::1], int64[::1], float64)")
 def sample_lines(knots: Floats, start: Ints, step_m: float) -> tuple[Floats, Floats, Ints]:
     """Return points at most `step_m` apart along lines, unit directions, the line of each.
 

@@ -8,44 +8,24 @@ function of levels and sources alone. No step costs less than WIDTH, so all entr
 this width are final once it is their turn.
 """
 
-import math
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import CENTRE, beside
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.grid import CENTRE
+from canopy_skel.kernels.steps import COSTS, LENGTHS, UNREACHED, beside
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
-UNITS_PER_NAT = 4096
-UNREACHED = (1 << 31) - 1
 WIDTH = 5
 WINDOW = 8192
 """Buckets of a round; the dearest step spans fewer than WINDOW of them."""
 MASK = 2 * WINDOW - 1
 
 
-def _costs() -> Int32s:
-    """Return the cost of a step by the sum of its two levels (0 to 510)."""
-    total = [0.0, *(-math.log(both / 510) * UNITS_PER_NAT for both in range(1, 511))]
-    return np.round(total).astype(np.int32)
-
-
-def _lengths() -> Int32s:
-    """Return what the length of a step adds, by direction."""
-    steps = np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0).ravel()
-    lengths: Int32s = np.array([0, 5, 7, 9], dtype=np.int32)[steps]
-    return lengths
-
-
-COSTS = _costs()
-LENGTHS = _lengths()
-
-
-@njit("int32[::1](int32[::1], int64)", cache=True, nogil=True)
+@inner("int32[::1](int32[::1], int64)")
 def resized(entries: Int32s, length: int) -> Int32s:
     """Return a copy with room for `length` entries, or of the first ones."""
     copy = np.empty(length, dtype=np.int32)
@@ -54,11 +34,7 @@ def resized(entries: Int32s, length: int) -> Int32s:
     return copy
 
 
-@njit(
-    "boolean(int64, uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("boolean(int64, uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1])")
 def pull(
     v: int, levels: Bytes, neighbours: Int32s, distance: Int32s, previous: Bytes, label: Int32s
 ) -> bool:
@@ -79,11 +55,7 @@ def pull(
     return True
 
 
-@njit(
-    "int32[::1](int32[::1], int32[:,::1], int32[::1], uint8[::1], uint8[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("int32[::1](int32[::1], int32[:,::1], int32[::1], uint8[::1], uint8[::1])")
 def invalidate(
     seeds: Int32s, neighbours: Int32s, distance: Int32s, previous: Bytes, touched: Bytes
 ) -> Int32s:
@@ -115,11 +87,7 @@ def invalidate(
     return resized(stack, count)
 
 
-@njit(
-    "int64(int32[::1], int32[::1], uint8[::1], int32[::1], int32[:,::1], int64[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("int64(int32[::1], int32[::1], uint8[::1], int32[::1], int32[:,::1], int64[::1])")
 def fill_ring(
     waiting: Int32s, distance: Int32s, queued: Bytes, heads: Int32s, pool: Int32s, state: Ints
 ) -> int:
@@ -149,7 +117,7 @@ def fill_ring(
     return kept
 
 
-@njit("int32[::1](int32[::1], int64, int32[::1], int32[:,::1], int64)", cache=True, nogil=True)
+@inner("int32[::1](int32[::1], int64, int32[::1], int32[:,::1], int64)")
 def empty_ring(waiting: Int32s, kept: int, heads: Int32s, pool: Int32s, count: int) -> Int32s:
     """Return the slots that wait, those still in the buckets among them."""
     waiting = resized(waiting, kept + count)
@@ -163,7 +131,7 @@ def empty_ring(waiting: Int32s, kept: int, heads: Int32s, pool: Int32s, count: i
     return waiting
 
 
-@njit("int32[:,::1](int32[:,::1], int64)", cache=True, nogil=True)
+@inner("int32[:,::1](int32[:,::1], int64)")
 def larger(pool: Int32s, length: int) -> Int32s:
     """Return a copy of a pool (N, 2) with room for `length` entries."""
     copy = np.empty((length, 2), dtype=np.int32)
@@ -172,11 +140,9 @@ def larger(pool: Int32s, length: int) -> Int32s:
     return copy
 
 
-@njit(
+@inner(
     "void(int64, uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1], uint8[::1],"
-    " uint8[::1], int32[::1], int32[:,::1], int64[::1])",
-    cache=True,
-    nogil=True,
+    " uint8[::1], int32[::1], int32[:,::1], int64[::1])"
 )
 def relax(
     u: int,
@@ -221,11 +187,9 @@ def relax(
         state[1] += 1
 
 
-@njit(
+@inner(
     "int64(int32[::1], uint8[::1], int32[:,::1], int32[::1], uint8[::1], int32[::1], uint8[::1],"
-    " uint8[::1])",
-    cache=True,
-    nogil=True,
+    " uint8[::1])"
 )
 def settle(
     waiting: Int32s,
@@ -274,11 +238,9 @@ def settle(
     return settled
 
 
-@njit(
+@kernel(
     "int64(int32[::1], int32[::1], int32[::1], int32[::1], int32[::1], uint8[::1], int32[:,::1],"
-    " int32[::1], uint8[::1], int32[::1], uint8[::1], uint8[::1])",
-    cache=True,
-    nogil=True,
+    " int32[::1], uint8[::1], int32[::1], uint8[::1], uint8[::1])"
 )
 def repair(
     raised: Int32s,

@@ -3,21 +3,20 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.blocks import find
+from canopy_skel.kernels.across import draw
+from canopy_skel.kernels.compiled import kernel
+from canopy_skel.kernels.grid import find
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Int32s = NDArray[np.int32]
 
 
-@njit(
+@kernel(
     "Tuple((float64[:,::1], float64[:,::1]))(float64[:,::1], float64[:,::1], float64[:,::1],"
-    " int64[::1], int32[:,:,::1], int64[::1], int32[:,::1], float64, float64, float64)",
-    cache=True,
-    nogil=True,
+    " int64[::1], int32[:,:,::1], int64[::1], int32[:,::1], float64, float64, float64)"
 )
 def mean_shift_across(
     points: Floats,
@@ -63,13 +62,7 @@ def mean_shift_across(
                 total += weight
                 ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
                 ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
-        norm = math.sqrt(ex * ex + ey * ey + ez * ez)
-        if total > 0.0 and norm > 1e-9:
-            ex, ey, ez = ex / norm, ey / norm, ez / norm
-            ox, oy, oz = ox / total, oy / total, oz / total
-            along = ox * ex + oy * ey + oz * ez
-            px, py, pz = px + ox - along * ex, py + oy - along * ey, pz + oz - along * ez
-            dx, dy, dz = ex, ey, ez
         moved[i, 0], moved[i, 1], moved[i, 2] = px, py, pz
         turned[i, 0], turned[i, 1], turned[i, 2] = dx, dy, dz
+        draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i])
     return moved, turned

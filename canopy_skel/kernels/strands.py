@@ -6,8 +6,9 @@ never makes one strand of two branches.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner, kernel
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -19,7 +20,7 @@ ACROSS = 0.35
 """How far aside a link may jump, in radii; the half width of a middle line's band."""
 
 
-@njit(cache=True, nogil=True)
+@kernel("void(boolean[:,::1], float32[:,:,::1], float32[:,:,::1])")
 def smoothed(inside: Bool, maps: F32, out: F32) -> None:
     """Fill out (K, h, w) with the mean of the maps over those of 3 x 3 cells that are inside."""
     count, height, width = maps.shape
@@ -40,7 +41,7 @@ def smoothed(inside: Bool, maps: F32, out: F32) -> None:
                 out[k, i, j] /= near
 
 
-@njit(cache=True)
+@inner("boolean(boolean[:,::1], int64, int64)")
 def _joins_nothing(core: Bool, i: int, j: int) -> bool:
     """Say whether a cell is neither the end of a line nor what holds two parts together."""
     p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
@@ -55,7 +56,7 @@ def _joins_nothing(core: Bool, i: int, j: int) -> bool:
     return min(one, two) >= 2
 
 
-@njit(cache=True)
+@inner("boolean(boolean[:,::1], int64, int64, boolean)")
 def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
     """Say whether a cell may go in this half of a round of Guo and Hall (1989)."""
     p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
@@ -70,7 +71,21 @@ def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
     return not ((p6 or p7 or not p9) and p8)
 
 
-@njit(cache=True, nogil=True)
+@inner("int64(boolean[:,::1], int32[:,::1], boolean[::1], int64)")
+def _swept(core: Bool, live: I32, marked: Bool, count: int) -> int:
+    """Take marked cells out of the core and of the list of live ones; return how many are left."""
+    kept = 0
+    for k in range(count):
+        i, j = live[k, 0], live[k, 1]
+        if marked[k]:
+            core[i, j] = False
+        else:
+            live[kept, 0], live[kept, 1] = i, j
+            kept += 1
+    return kept
+
+
+@kernel("int32[:,::1](boolean[:,::1])")
 def thinned(core: Bool) -> I32:
     """Thin a core (h, w) to lines one cell wide, in place; return (N, 2) row and column of them.
 
@@ -101,21 +116,7 @@ def thinned(core: Bool) -> I32:
     return live[:count].copy()
 
 
-@njit(cache=True)
-def _swept(core: Bool, live: I32, marked: Bool, count: int) -> int:
-    """Take marked cells out of the core and of the list of live ones; return how many are left."""
-    kept = 0
-    for k in range(count):
-        i, j = live[k, 0], live[k, 1]
-        if marked[k]:
-            core[i, j] = False
-        else:
-            live[kept, 0], live[kept, 1] = i, j
-            kept += 1
-    return kept
-
-
-@njit(cache=True)
+@inner("float64(float32[:,:,::1], int32[::1], int32[::1], float64, float64[::1])")
 def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
     """Return what it costs to go from cell a to b, inf if it is out of the question.
 
@@ -139,13 +140,13 @@ def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
     return float(price if along > 0 else -price)
 
 
-@njit(cache=True)
+@inner("int64(float32, int64)")
 def _window(log_radius: float, tries: int) -> int:
     """Return how far to look for the next cell; farther with each try."""
     return int(min(max(1.0 + 1.5 * ACROSS * np.exp(log_radius), 2.0) + tries, 9.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel("int32[:,::1](int32[:,::1], int32[:,::1], float32[:,:,::1], float64[::1], int64)")
 def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
     """Return (N, 2) the cell that each is linked with behind and ahead, -1 = none.
 
@@ -187,7 +188,7 @@ def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
     return link
 
 
-@njit(cache=True, nogil=True)
+@kernel("Tuple((int32[::1], int64[::1]))(int32[:,::1])")
 def chains(link: I32) -> tuple[I32, I64]:
     """Return the cells in the order of their chains, and where each chain starts and ends.
 
@@ -218,7 +219,7 @@ def chains(link: I32) -> tuple[I32, I64]:
     return order, np.array(starts)
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64(int32[:,::1], float64, float64[::1])")
 def bend(path: I32, radius: float, rule: F64) -> int:
     """Return which cell of a path lies farthest off its chord if that is a bend, else -1.
 
@@ -237,7 +238,7 @@ def bend(path: I32, radius: float, rule: F64) -> int:
     return where
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64[:,::1](int32[:,::1], int64[::1], float32[:,::1], float64[::1], float64)")
 def straight_pieces(cells: I32, starts: I64, log_radius: F32, rule: F64, least_cells: float) -> I64:
     """Cut chains where they bend; return (M, 2) begin and end of the pieces long enough.
 
@@ -270,7 +271,7 @@ def straight_pieces(cells: I32, starts: I64, log_radius: F32, rule: F64, least_c
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64(int32[:,::1], int64[:,::1], float32[:,::1], int32[:,::1])")
 def painted(cells: I32, pieces: I64, log_radius: F32, label: I32) -> int:
     """Number pieces in `label` (h, w) in the order given; return how many.
 
@@ -303,7 +304,7 @@ def painted(cells: I32, pieces: I64, log_radius: F32, label: I32) -> int:
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel("void(int32[:,::1], boolean[:,::1], float32[:,::1], float64)")
 def grown(label: I32, inside: Bool, log_radius: F32, reach: float) -> None:
     """Let regions grow over inside cells, nearest first, up to `reach` radii from where they were.
 

@@ -3,8 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner, kernel
+
+Floats = NDArray[np.float64]
 
 SECTION_PX = 6.0
 """Length of a cross-section along the mask: about the width of a twig, or pixels would show."""
@@ -12,8 +15,22 @@ WIDE_SHARE = 2.0 / 3.0
 """Of the mask's area, how much lies in cross-sections that are narrower than its width."""
 
 
-@njit("void(boolean[:,:], float64[::1])", cache=True, nogil=True)
-def measure(mask: NDArray[np.bool_], strip: NDArray[np.float64]) -> None:
+@inner("float64(float64[::1], int64, int64)")
+def sort(values: Floats, first: int, end: int) -> float:
+    """Sort values [first, end), of which there are few, in place; return their sum."""
+    total = 0.0
+    for i in range(first, end):
+        value, at = values[i], i
+        total += value
+        while at > first and values[at - 1] > value:
+            values[at] = values[at - 1]
+            at -= 1
+        values[at] = value
+    return total
+
+
+@kernel("void(boolean[:,:], float64[::1])")
+def measure(mask: NDArray[np.bool_], strip: Floats) -> None:
     """Write half the width of a mask in pixels, its mean pixel (u, v), its unit direction (u, v).
 
     The width is the quantile `WIDE_SHARE` of those of cross-sections, by area. Leaves can only make
@@ -47,11 +64,11 @@ def measure(mask: NDArray[np.bool_], strip: NDArray[np.float64]) -> None:
             if mask[v, u]:
                 t = (u - mu) * du + (v - mv) * dv
                 area[min(int((t - low) * per_px), sections - 1)] += 1.0
-    if sections > 4 and area[1:-1].sum() > 0.0:
-        # Those at the ends are cut off slantwise.
-        area = area[1:-1]
-    area = np.sort(area)
-    wanted, so_far, widest = WIDE_SHARE * area.sum(), 0.0, 0
+    first, end = 0, sections
+    if sections > 4 and count > area[0] + area[sections - 1]:
+        first, end = 1, sections - 1  # Those at the ends are cut off slantwise.
+    wanted = WIDE_SHARE * sort(area, first, end)
+    so_far, widest = 0.0, first
     while so_far + area[widest] < wanted:
         so_far += area[widest]
         widest += 1

@@ -9,10 +9,10 @@ turn into vector instructions: the same bits on every machine, within one unit o
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.ellipsoid import RUN
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.grid import RUN
 
 Bytes = NDArray[np.uint8]
 Float32s = NDArray[np.float32]
@@ -34,7 +34,7 @@ _ROOT_HALF, _MANTISSA = np.int32(0x3F3504F3), np.int32(23)
 _SEEN = np.uint8(2)
 
 
-@njit("void(float32[::1], int32[::1], int32[::1])", error_model="numpy", cache=True, nogil=True)
+@inner("void(float32[::1], int32[::1], int32[::1])", error_model="numpy")
 def units_of(empty: Float32s, bits: Int32s, units: Int32s) -> None:
     """Write round(-log(empty)) in map units; `bits` must be a view of `empty`, which is lost.
 
@@ -53,11 +53,7 @@ def units_of(empty: Float32s, bits: Int32s, units: Int32s) -> None:
         units[i] = np.int32(nat * _UNITS + _HALF)
 
 
-@njit(
-    "void(float32[:,::1], int64, int64, float32[::1], float32[::1], int32[::1], int32[::1])",
-    cache=True,
-    nogil=True,
-)
+@inner("void(float32[:,::1], int64, int64, float32[::1], float32[::1], int32[::1], int32[::1])")
 def measure(
     terms: Float32s,
     first: int,
@@ -87,11 +83,9 @@ def measure(
     units_of(empty[: RUN * count], bits[: RUN * count], units[: RUN * count])
 
 
-@njit(
+@inner(
     "int64(int32[::1], int64, int64, int32[::1], int64, int32[:,::1], uint8[:,::1], int32[::1],"
-    " int64)",
-    cache=True,
-    nogil=True,
+    " int64)"
 )
 def add_to_runs(
     runs: Int32s,
@@ -119,11 +113,9 @@ def add_to_runs(
     return found
 
 
-@njit(
+@inner(
     "int64(int32[::1], int8[::1], int64, int64, int32[::1], int64, int64, int32[:,::1],"
-    " uint8[:,::1], int32[::1], int64)",
-    cache=True,
-    nogil=True,
+    " uint8[:,::1], int32[::1], int64)"
 )
 def add_rest(
     runs: Int32s,
@@ -149,11 +141,7 @@ def add_rest(
     return found
 
 
-@njit(
-    "int32[::1](int32[::1], int32[:,::1], uint8[:,::1], uint8[::1], uint8[:,::1])",
-    cache=True,
-    nogil=True,
-)
+@kernel("int32[::1](int32[::1], int32[:,::1], uint8[:,::1], uint8[::1], uint8[:,::1])")
 def renew_levels(
     seen: Int32s, sums: Int32s, levels: Bytes, level_table: Bytes, marks: Bytes
 ) -> Int32s:
@@ -181,11 +169,9 @@ def renew_levels(
     return result
 
 
-@njit(
+@kernel(
     "int64(int64[::1], int32[::1], float32[:,::1], int8[::1], float32[:,::1], int64, int32[:,::1],"
-    " uint8[:,::1], int32[::1], int64)",
-    cache=True,
-    nogil=True,
+    " uint8[:,::1], int32[::1], int64)"
 )
 def accumulate(
     starts: Ints,

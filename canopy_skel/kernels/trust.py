@@ -6,8 +6,10 @@ All masks of a view lie one after the other: pixels of mask i are start[i] up to
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.median import median_of
 
 Bools = NDArray[np.bool_]
 Float32s = NDArray[np.float32]
@@ -18,7 +20,7 @@ ROUNDS = 6
 """Of reweighted least squares."""
 
 
-@njit("boolean(boolean[::1], int64[::1], int64, int64, int64)", cache=True, nogil=True)
+@inner("boolean(boolean[::1], int64[::1], int64, int64, int64)")
 def is_inner(mask: Bools, box: Ints, v: int, u: int, margin: int) -> bool:
     """Say whether all pixels of a mask (h * w,) within `margin` of row v, column u are in it."""
     height, width = box[2], box[3]
@@ -31,11 +33,9 @@ def is_inner(mask: Bools, box: Ints, v: int, u: int, margin: int) -> bool:
     return True
 
 
-@njit(
+@kernel(
     "Tuple((float64[:,::1], int64[::1], int64[::1]))(boolean[::1], int64[:,::1],"
-    " Array(float32, 2, 'C', readonly=True), int64, float64, float64, float64)",
-    cache=True,
-    nogil=True,
+    " Array(float32, 2, 'C', readonly=True), int64, float64, float64, float64)"
 )
 def pixels_of(
     masks: Bools,
@@ -81,45 +81,14 @@ def pixels_of(
     return pixels[:count].copy(), start, sizes
 
 
-@njit("float64(float64[::1])", cache=True, nogil=True)
-def median_of(values: Floats) -> float:
-    """Return the median of values, whose order is lost (Hoare's selection)."""
-    n = len(values)
-    low, high, middle = 0, n - 1, n // 2
-    while low < high:
-        pivot = values[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
-        else:
-            break
-    if n % 2:
-        return float(values[middle])
-    below = -math.inf
-    for i in range(middle):
-        below = max(below, values[i])
-    return float(0.5 * (below + values[middle]))
-
-
-@njit("float64(float64, float64)", cache=True, nogil=True)
+@inner("float64(float64, float64)")
 def tolerance_at(disparity: float, tolerance_m: float) -> float:
     """Return what a tolerance in depth is in disparity (1/m); constant beyond 1.25 m."""
     near = max(disparity, 0.8)
     return tolerance_m * near * near
 
 
-@njit("void(float64[:,::1], int64, int64, float64[::1])", cache=True, nogil=True)
+@inner("void(float64[:,::1], int64, int64, float64[::1])")
 def places_along(pixels: Floats, first: int, end: int, along: Floats) -> None:
     """Write where pixels (u, v) lie along the axis of largest spread, from -1 to 1."""
     mu = mv = uu = uv = vv = 0.0
@@ -138,11 +107,8 @@ def places_along(pixels: Floats, first: int, end: int, along: Floats) -> None:
         along[n] /= longest
 
 
-@njit(
-    "UniTuple(float64, 2)(float64[::1], float64[::1], int64[:,::1], float64)",
-    error_model="numpy",
-    cache=True,
-    nogil=True,
+@inner(
+    "UniTuple(float64, 2)(float64[::1], float64[::1], int64[:,::1], float64)", error_model="numpy"
 )
 def best_line(
     along: Floats, disparity: Floats, draws: Ints, tolerance_m: float
@@ -177,7 +143,7 @@ def best_line(
     return levels[best], slopes[best]
 
 
-@njit("UniTuple(float64, 3)(float64[::1], float64)", error_model="numpy", cache=True, nogil=True)
+@inner("UniTuple(float64, 3)(float64[::1], float64)", error_model="numpy")
 def parabola_of(sums: Floats, pull: float) -> tuple[float, float, float]:
     """Solve the normal equations of a parabola, with a slight pull towards 0 on all three.
 
@@ -195,11 +161,9 @@ def parabola_of(sums: Floats, pull: float) -> tuple[float, float, float]:
     return (sums[5] - b * slope - c * bent) / a, slope, bent
 
 
-@njit(
+@inner(
     "UniTuple(float64, 3)(float64[::1], float64[::1], UniTuple(float64, 3), float64)",
     error_model="numpy",
-    cache=True,
-    nogil=True,
 )
 def reweighted(
     along: Floats, disparity: Floats, profile: tuple[float, float, float], tolerance_m: float
@@ -223,11 +187,7 @@ def reweighted(
     return parabola_of(sums, 1e-6 * len(along))
 
 
-@njit(
-    "boolean[::1](float64[:,::1], int64[::1], int64[:,::1], float64, int64)",
-    cache=True,
-    nogil=True,
-)
+@kernel("boolean[::1](float64[:,::1], int64[::1], int64[:,::1], float64, int64)")
 def follow_profiles(
     pixels: Floats, start: Ints, draws: Ints, tolerance_m: float, min_points: int
 ) -> Bools:

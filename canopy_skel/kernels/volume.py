@@ -6,22 +6,23 @@ Lengths are in voxels; voxel (x, y, z) has its centre at (x + 0.5, y + 0.5, z + 
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from canopy_skel.kernels.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
 Int32s = NDArray[np.int32]
 UInt8s = NDArray[np.uint8]
 
 
-@njit(cache=True, nogil=True)
+@inner("UniTuple(int64, 2)(float64, float64, float64)")
 def first_and_last(a: float, b: float, radius: float) -> tuple[int, int]:
     """Return [first, last) voxel whose centre lies within `radius` of the span from a to b."""
     low, high = min(a, b) - radius, max(a, b) + radius
     return max(math.ceil(low - 0.5), 0), math.floor(high - 0.5) + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel("void(float64[:,::1], float64[:,::1], float64[:,::1], int32[:,:,::1])")
 def mark_blocks(starts: Floats, ends: Floats, radii: Floats, top: Int32s) -> None:
     """Set top = 1 for every 8^3 block that the box around some tube touches."""
     for i in range(len(starts)):
@@ -35,7 +36,7 @@ def mark_blocks(starts: Floats, ends: Floats, radii: Floats, top: Int32s) -> Non
                     top[x, y, z] = 1
 
 
-@njit(cache=True, nogil=True)
+@kernel("void(float64[:,::1], float64[:,::1], float64[:,::1], int32[:,:,::1], uint8[:,::1])")
 def fill_tubes(starts: Floats, ends: Floats, radii: Floats, top: Int32s, filled: UInt8s) -> None:
     """Set filled[top[block], offset] = 1 for the voxels inside some tube.
 
@@ -43,8 +44,8 @@ def fill_tubes(starts: Floats, ends: Floats, radii: Floats, top: Int32s, filled:
     and end) at the nearest point of the axis, so that tubes end in half balls.
     """
     for i in range(len(starts)):
-        ax, ay, az = starts[i]
-        dx, dy, dz = ends[i] - starts[i]
+        ax, ay, az = starts[i, 0], starts[i, 1], starts[i, 2]
+        dx, dy, dz = ends[i, 0] - ax, ends[i, 1] - ay, ends[i, 2] - az
         square = max(dx * dx + dy * dy + dz * dz, 1e-12)
         r0, taper = radii[i, 0], radii[i, 1] - radii[i, 0]
         radius = max(radii[i, 0], radii[i, 1])

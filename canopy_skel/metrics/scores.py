@@ -127,7 +127,7 @@ def score(
 
 
 def _figures(both: Comparison, spacing_m: float) -> Scores:
-    out, true, tolerance_m = both.out, both.true, both.tolerance_m
+    out, true = both.out, both.true
     precision, recall, osr = both.counts()
     precision_vertices, recall_vertices, osr_vertices = both.vertex_counts()
     precision_strict, osr_strict = both.strict()
@@ -138,8 +138,7 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
     v_det = both.detectable()
     components, acyclic = components_and_acyclic(len(out.positions), out.document.edges)
     all_m = out.pieces.length_m
-    predicted_m = all_m * both.predicted
-    confidence = out.pieces.blend(out.document.confidence)
+    (ece, brier), (ece_occluded, brier_occluded) = _calibration(both)
     return Scores(
         precision=precision,
         recall=recall,
@@ -165,18 +164,38 @@ def _figures(both: Comparison, spacing_m: float) -> Scores:
         auc=both.f1_area(),
         radius_error_median=radius_error_median,
         radius_error_mean=radius_error_mean,
-        ece=expected_calibration_error(confidence, both.right, all_m),
-        brier=brier_score(confidence, both.right, all_m),
-        ece_occluded=expected_calibration_error(confidence, both.right, predicted_m),
-        brier_occluded=brier_score(confidence, both.right, predicted_m),
-        parent_correct=parent_correct(
-            out.document, true.document, tolerance_m=tolerance_m, spacing_m=spacing_m
-        ),
+        ece=ece,
+        brier=brier,
+        ece_occluded=ece_occluded,
+        brier_occluded=brier_occluded,
+        parent_correct=_parents(both, spacing_m),
         components=components,
         acyclic=acyclic,
         output_length_m=float(all_m.sum()),
         truth_length_m=float(true.pieces.length_m.sum()),
-        tolerance_m=tolerance_m,
+        tolerance_m=both.tolerance_m,
+        spacing_m=spacing_m,
+    )
+
+
+def _calibration(both: Comparison) -> list[tuple[float | None, float | None]]:
+    """Return ECE and Brier score of the whole output, and of what of it is predicted."""
+    out = both.out
+    confidence = out.pieces.blend(out.document.confidence)
+    return [
+        (
+            expected_calibration_error(confidence, both.right, weight),
+            brier_score(confidence, both.right, weight),
+        )
+        for weight in (out.pieces.length_m, out.pieces.length_m * both.predicted)
+    ]
+
+
+def _parents(both: Comparison, spacing_m: float) -> float | None:
+    return parent_correct(
+        both.out.document,
+        both.true.document,
+        tolerance_m=both.tolerance_m,
         spacing_m=spacing_m,
     )
 

@@ -66,7 +66,7 @@ def read_state(path: Path, sha256: str | None, most_bytes: int) -> dict[str, Ten
 
     Raises:
         UsageError: it cannot be read, is too large, has another SHA-256, or holds anything but
-            tensors by name.
+            tensors of finite numbers by name.
     """
     data = _bytes(path, most_bytes)
     found = hashlib.sha256(data).hexdigest()
@@ -87,7 +87,13 @@ def read_state(path: Path, sha256: str | None, most_bytes: int) -> dict[str, Ten
             f"{path}: is of another architecture: it holds no tensors by name; give weights of this"
             " segmenter"
         )
-    return {str(name): _widened(value) for name, value in state.items()}
+    widened = {str(name): _widened(value) for name, value in state.items()}
+    for name, value in widened.items():
+        if not value.isfinite().all():
+            raise UsageError(
+                f"{path}: {name} holds numbers that are none (infinite, or not numbers); train anew"
+            )
+    return widened
 
 
 def _widened(value: Tensor) -> Tensor:

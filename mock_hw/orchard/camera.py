@@ -49,7 +49,9 @@ def scaled(camera: Camera, scale: float) -> Camera:
     one = camera.intrinsics
     size_px = scale * one.width_px, scale * one.height_px
     if not (0 < scale <= 1 and min(size_px) >= 1):
-        raise UsageError(f"no pictures scaled by {scale}; give more than 0, up to 1")
+        raise UsageError(
+            f"no pictures scaled by {scale}; give more than 0, up to 1, that leaves a pixel"
+        )
     width_px, height_px = map(round, size_px)
     across, down = width_px / one.width_px, height_px / one.height_px
     # Pixel centres are at whole numbers, so the picture's corner is at -0.5.

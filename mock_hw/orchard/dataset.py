@@ -5,10 +5,10 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from hashlib import file_digest
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.recording import read_recording
@@ -169,9 +169,21 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def recorded_in(document: Mapping[str, Any]) -> list[Recorded]:
-    """Return the recordings that a manifest lists."""
-    names = [one.name for one in fields(Recorded)]
-    return [Recorded(**{name: entry[name] for name in names}) for entry in document["recordings"]]
+    """Return the recordings that a manifest lists.
+
+    Raises:
+        KeyError: an entry lacks something.
+        TypeError: an entry has something of another type.
+    """
+    kinds = get_type_hints(Recorded)
+    recordings = []
+    for entry in document["recordings"]:
+        own = {name: entry[name] for name in kinds}
+        for name, kind in kinds.items():
+            if not isinstance(own[name], int | float if kind is float else kind):
+                raise TypeError(f"{name} is {own[name]!r}")
+        recordings.append(Recorded(**own))
+    return recordings
 
 
 def write_manifest(

@@ -5,19 +5,21 @@ import shlex
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress, TaskID
 
 from canopy_skel.errors import UsageError
 from canopy_skel.pipeline import METHODS
-from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
+from service.cli.shell import WIDEST_RANGE, AsJson, Exit, Out, progress_bars, stderr
 from service.experiment.orchard import Choice, Orchard, read_orchard
 from service.experiment.report import Report, rows_csv
 from service.experiment.rows import Row, RowStore
-from service.experiment.run import Experiment, run
 from service.outputs import require_writable, write_all
+
+if TYPE_CHECKING:
+    from service.experiment.run import Experiment
 
 STORE = "rows.jsonl"
 SEGMENTERS = "recorded,false20,drop50,drop25+false20,drop50+false20"
@@ -52,6 +54,8 @@ def paper_table(
     Rows that are there already are kept: after an interruption the same command goes on, and an
     orchard that still grows may be used at any time.
     """
+    from service.experiment.run import Experiment, run
+
     choice = Choice(
         species=_names(species), topologies=_numbers(topologies), foliage=_numbers(foliage)
     )
@@ -76,13 +80,12 @@ def paper_table(
         "foliage": foliage,
     }
     files = _write(output, _command(orchard, output, options), plan, rows, figures=figures)
-    code = _complain(plan.orchard, rows)
     if as_json:
         typer.echo(json.dumps(_summary(plan, rows, files), indent=2))
     else:
         for file in files:
             typer.echo(file)
-    raise typer.Exit(code)
+    raise typer.Exit(_complain(plan.orchard, rows))
 
 
 def _command(orchard: Path, output: Path, options: dict[str, str]) -> str:
@@ -94,7 +97,7 @@ def _command(orchard: Path, output: Path, options: dict[str, str]) -> str:
 
 
 def _write(
-    output: Path, command: str, plan: Experiment, rows: list[Row], *, figures: bool
+    output: Path, command: str, plan: "Experiment", rows: list[Row], *, figures: bool
 ) -> list[Path]:
     pictures: dict[str, tuple[str, bytes]] = {}
     if figures:
@@ -144,7 +147,7 @@ def _complain(orchard: Orchard, rows: list[Row]) -> Exit:
     return Exit.PARTIAL if failed or orchard.missing or orchard.warnings else Exit.OK
 
 
-def _summary(plan: Experiment, rows: list[Row], files: list[Path]) -> dict[str, object]:
+def _summary(plan: "Experiment", rows: list[Row], files: list[Path]) -> dict[str, object]:
     return {
         "trees": len(plan.orchard.trees),
         "missing": list(plan.orchard.missing),
@@ -173,5 +176,8 @@ def _numbers(text: str) -> tuple[int, ...]:
         first, dash, last = part.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
             raise UsageError(f"{text!r}: give numbers as 0,3,5-7")
-        numbers += range(int(first), int(last or first) + 1)
+        ends = int(first), int(last or first)
+        if not 0 <= ends[1] - ends[0] < WIDEST_RANGE:
+            raise UsageError(f"{text!r}: {part} is no range; give the smaller number first")
+        numbers += range(ends[0], ends[1] + 1)
     return tuple(dict.fromkeys(numbers))

@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from canopy_skel.errors import UsageError
 from service.cli.shell import stderr
-from service.training.coco import read_coco
-from service.training.labelme import read_labelme
-from service.training.user_pictures import UserPicture
+
+if TYPE_CHECKING:
+    from service.training.user_pictures import UserPicture
 
 Coco = Annotated[Path | None, typer.Option(help="Labels: a COCO instance file (JSON).")]
 Images = Annotated[Path | None, typer.Option(help="The folder of the pictures of --coco.")]
@@ -35,12 +35,16 @@ class Labels:
         """The file or folder of labels, None if none is given."""
         return self.coco or self.labelme
 
-    def pictures(self) -> list[UserPicture]:
+    def pictures(self) -> "list[UserPicture]":
         """Return the labelled pictures; warn on stderr.
 
         Raises:
             UsageError: not exactly one kind of labels is given, or they are unusable.
         """
+        # Imported here: that compiles kernels which no other verb needs.
+        from service.training.coco import read_coco
+        from service.training.labelme import read_labelme
+
         if (self.coco is None) is (self.labelme is None):
             raise UsageError("give labels: either --coco FILE with --images DIR, or --labelme DIR")
         if self.labelme is not None:

@@ -55,6 +55,7 @@ def segment(
     if not sources or output is None:
         raise UsageError("give pictures or recordings, and a folder for the results (-o)")
     _require_distinct(sources)
+    _require_no_folder(sources)
     require_writable(output)
     made = make_segmenter(segmenter, weights)
     results: list[dict[str, object]] = []
@@ -102,6 +103,12 @@ def _say(result: Segmented) -> None:
         typer.echo(f"  {file}")
 
 
+def _require_no_folder(sources: list[Path]) -> None:
+    for path in sources:
+        if path.is_dir():
+            raise UsageError(f"{path}: is a folder; name the pictures or recordings in it")
+
+
 def _require_distinct(sources: list[Path]) -> None:
     names = [path.stem if path.suffix.lower() in SUFFIXES else path.name for path in sources]
     for name in names:
@@ -120,6 +127,9 @@ def _evaluated(
     from service.evaluation import Evaluation, evaluate, evaluate_recording
     from service.training.user_pictures import UserPictures
 
+    for path in sources:
+        if path.suffix.lower() in SUFFIXES:
+            raise UsageError(f"{path}: is a picture without labels; give them (--coco, --labelme)")
     if bool(sources) is (labels.source is not None):
         raise UsageError("--evaluate needs recordings, or labels (--coco with --images, --labelme)")
     if name == "recorded":

@@ -16,6 +16,9 @@ stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 Out = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
 
+WIDEST_RANGE = 100_000
+"""More numbers than anybody means by a range like 0-9."""
+
 
 class Exit(IntEnum):
     """What a caller learns from the exit code."""

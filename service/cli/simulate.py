@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from canopy_skel.errors import UsageError
-from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
+from service.cli.shell import WIDEST_RANGE, AsJson, Exit, Out, progress_bars, stderr
 from service.outputs import require_writable
 from service.skeletons import SOFTWARE
 
 if TYPE_CHECKING:
     from mock_hw.orchard.dataset import Recorded
-
-WIDEST_RANGE = 100_000
 
 
 def simulate(

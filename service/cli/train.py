@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import Progress, TaskID
@@ -13,7 +13,9 @@ from canopy_skel.errors import UsageError
 from service.cli.labels import Branch, Coco, Images, LabelMe, Labels
 from service.cli.shell import AsJson, Out, progress_bars, stderr
 from service.outputs import require_writable
-from service.training.user_pictures import UserPicture
+
+if TYPE_CHECKING:
+    from service.training.user_pictures import UserPicture
 
 RECIPES = ("builtin",)
 NETWORKS = ("unet", "maskrcnn")
@@ -62,14 +64,17 @@ def train(
     """Train a segmenter on your labelled pictures, or anew on synthetic ones.
 
     OUTPUT gets the weights (unet.pt and unet.json, or maskrcnn.*), the pictures, checkpoints and
-    the log; a broken-off run is gone on with.
+    the log; a broken-off run of unet is gone on with.
     """
+    _require_amounts(minutes=minutes, steps=steps, scenes=scenes)
     if segmenter not in NETWORKS:
         raise UsageError(f"unknown segmenter {segmenter!r}: choose one of {', '.join(NETWORKS)}")
     length = _Length(minutes=minutes, steps=steps)
     weights = output / f"{segmenter}.pt"
     labels = Labels(coco=coco, images=images, labelme=labelme, branch=branch or ())
     if labels.source is None:
+        if images is not None or branch or init is not None:
+            raise UsageError("--images, --branch and --init go with labels: give --coco, --labelme")
         facts = _by_recipe(output, recipe or BUILTIN, segmenter, length, scenes)
     elif recipe is not None or scenes is not None:
         raise UsageError("give either labels (--coco, --labelme) or --recipe")
@@ -82,6 +87,12 @@ def train(
     typer.echo(f"  judged on: {facts['validation']['kind']}")
     for name, value in facts["validation"]["reported"].items():
         typer.echo(f"  {name:24} {'none' if value is None else f'{value:g}'}")
+
+
+def _require_amounts(**amounts: float | None) -> None:
+    for name, amount in amounts.items():
+        if amount is not None and not amount > 0:
+            raise UsageError(f"--{name} {amount}: give more than 0")
 
 
 def _by_recipe(
@@ -107,7 +118,7 @@ def _by_recipe(
 
 def _on_labels(
     output: Path,
-    pictures: list[UserPicture],
+    pictures: "list[UserPicture]",
     segmenter: str,
     init: str | None,
     length: _Length,
@@ -122,7 +133,7 @@ def _on_labels(
 
 
 def _unet(
-    output: Path, pictures: list[UserPicture], init: str | None, length: _Length, show: Show
+    output: Path, pictures: "list[UserPicture]", init: str | None, length: _Length, show: Show
 ) -> tuple[tuple[str, ...], Facts]:
     from canopy_skel.segmenters.unet import weights
     from service.training.user_recipe import FINE_PLAN, SCRATCH_PLAN, user_weights
@@ -135,7 +146,7 @@ def _unet(
 
 
 def _maskrcnn(
-    output: Path, pictures: list[UserPicture], init: str | None, length: _Length, show: Show
+    output: Path, pictures: "list[UserPicture]", init: str | None, length: _Length, show: Show
 ) -> tuple[tuple[str, ...], Facts]:
     from service.training.maskrcnn import MaskRcnnPlan
     from service.training.maskrcnn_recipe import initial, maskrcnn_weights

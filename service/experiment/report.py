@@ -81,8 +81,10 @@ class Report:
             + ". Means over topologies ± standard error; every figure is explained in the page on"
             " metrics, and every row is in `rows.csv`. Simulated trees only.",
         ]
-        failed = [row for row in self.rows if row.failed]
-        lines += [f"\nFailed: {row.tree.name}: {row.values['error']}" for row in failed]
+        failed = dict.fromkeys(
+            f"\nFailed: {row.tree.name}: {row.values['error']}" for row in self.rows if row.failed
+        )
+        lines += failed
         if self.orchard.missing:
             lines.append(f"\nNot there yet: {', '.join(self.orchard.missing)}.")
         return "\n".join(lines)

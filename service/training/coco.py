@@ -116,11 +116,22 @@ def _key(path: Path, what: str, item: Mapping[str, Any], name: str) -> int | str
     return value
 
 
+def _keys(path: Path, what: str, items: Sequence[Mapping[str, Any]]) -> list[int | str]:
+    """Return the ids of images or categories; no two may have the same, as in files put together.
+
+    Raises:
+        UsageError: an id is missing, or there twice.
+    """
+    keys = [_key(path, what, item, "id") for item in items]
+    again = next((key for number, key in enumerate(keys) if key in keys[:number]), None)
+    if again is not None:
+        raise UsageError(f"{path}: {what} has id {again!r} as another one has; {_MEND}")
+    return keys
+
+
 def _categories(path: Path, items: Sequence[Mapping[str, Any]]) -> dict[int | str, str]:
-    return {
-        _key(path, "a category", item, "id"): _text(path, "a category", item, "name")
-        for item in items
-    }
+    names = [_text(path, "a category", item, "name") for item in items]
+    return dict(zip(_keys(path, "a category", items), names, strict=True))
 
 
 def _branch_names(path: Path, known: Sequence[str], branch: Sequence[str]) -> set[str]:
@@ -141,7 +152,7 @@ def _branch_names(path: Path, known: Sequence[str], branch: Sequence[str]) -> se
 
 
 def _pictures(path: Path, items: Sequence[Mapping[str, Any]]) -> dict[int | str, Mapping[str, Any]]:
-    return {_key(path, "an image", item, "id"): item for item in items}
+    return dict(zip(_keys(path, "an image", items), items, strict=True))
 
 
 def _require_known(

@@ -86,7 +86,7 @@ def _picture(
     branches: list[Shape] = []
     ignored: list[Shape] = []
     for number, item in enumerate(document["shapes"], start=1):
-        label = item.get("label")
+        label = str(item.get("label"))
         if label == IGNORE or label in wanted:
             shape = _shape(path, number, item)
             (ignored if label == IGNORE else branches).append(shape)

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import pickle
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -27,7 +28,9 @@ class Plan:
     """What a training run does.
 
     It ends after `steps` batches or after `minutes`, whichever comes first; the learning rate
-    falls as a cosine over that span. look_every: steps between validations and checkpoints.
+    falls as a cosine over that span. look_every: steps between validations and checkpoints. data:
+    a digest of the labels and the weights a user began with, so that a run is not gone on with on
+    others.
     """
 
     steps: int
@@ -42,6 +45,7 @@ class Plan:
     gradient_norm: float = 5.0
     look_every: int = 250
     channels: tuple[int, ...] = CHANNELS
+    data: str = ""
 
     def fields(self) -> dict[str, Any]:
         """Return the plan, ready for JSON: without `minutes` where there is no limit."""
@@ -178,17 +182,35 @@ def save(run: Run, folder: Path) -> None:
     torch.save(run.averaged.state_dict(), folder / f"average-{run.step:06d}.pt")
 
 
+def _checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        state = torch.load(path, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, OSError) as error:
+        raise UsageError(
+            f"{path}: is damaged; remove it to begin anew, or give another folder"
+        ) from error
+    if not isinstance(state, dict) or "plan" not in state:
+        raise UsageError(f"{path}: is no checkpoint of a training; give another folder")
+    found: dict[str, Any] = state
+    return found
+
+
 def resume(plan: Plan, folder: Path) -> Run | None:
     """Return the run a folder holds a checkpoint of, None if it holds none.
 
     Raises:
-        UsageError: the checkpoint is of another plan (its length may differ).
+        UsageError: the checkpoint is of another plan (its length may differ), or damaged.
     """
     path = folder / "checkpoint.pt"
     if not path.exists():
         return None
-    state = torch.load(path, weights_only=True)
-    then, now = state["plan"], asdict(plan)
+    state = _checkpoint(path)
+    then, now = {"data": "", **state["plan"]}, asdict(plan)
+    if then["data"] != now["data"]:
+        raise UsageError(
+            f"{path}: was trained on other labels, or began with other weights; give another folder"
+            " (and go on from what this one holds with --init)"
+        )
     for name in now.keys() - {"steps", "minutes", "look_every"}:
         if then[name] != now[name]:
             raise UsageError(

@@ -23,9 +23,9 @@ def decoded(counts: Sequence[int] | str, height: int, width: int) -> BoolArray:
     """
     lengths = _decompressed(counts) if isinstance(counts, str) else list(counts)
     if not all(isinstance(length, int) and length >= 0 for length in lengths):
-        raise ValueError("run lengths are whole numbers from 0 up")
+        raise ValueError("has run lengths that are not whole numbers from 0 up")
     if sum(lengths) != height * width:
-        raise ValueError(f"run lengths sum to {sum(lengths)}, not to {width} x {height} pixels")
+        raise ValueError(f"has run lengths of {sum(lengths)} pixels, not of the whole picture")
     values = np.arange(len(lengths)) % 2 == 1
     return np.repeat(values, lengths).reshape(width, height).T
 
@@ -36,7 +36,7 @@ def _decompressed(text: str) -> list[int]:
     for character in text:
         group = ord(character) - _FIRST
         if not 0 <= group < 2 * _MORE or groups == _MOST_GROUPS:
-            raise ValueError(f"{character!r} cannot stand there in compressed run lengths")
+            raise ValueError(f"has {character!r} in compressed run lengths, where it cannot stand")
         value |= (group & (_MORE - 1)) << (_GROUP_BITS * groups)
         groups += 1
         if not group & _MORE:
@@ -45,5 +45,5 @@ def _decompressed(text: str) -> list[int]:
             lengths.append(value + lengths[-2] if len(lengths) > 2 else value)
             value, groups = 0, 0
     if groups:
-        raise ValueError("compressed run lengths end in the middle of a number")
+        raise ValueError("has compressed run lengths that end in the middle of a number")
     return lengths

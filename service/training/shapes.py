@@ -61,6 +61,8 @@ class Shape:
         """
         if self.runs is not None:
             return _cropped(Region(left=0, top=0, mask=decoded(self.runs, *size)))
+        if (self.width_px or 0.0) > max(size):
+            raise ValueError(f"has a width of {self.width_px:g} pixels, more than the picture")
         points = np.concatenate(self.outlines)
         if not np.isfinite(points).all() or np.abs(points).max() > _LONGEST_EDGE * max(size):
             raise ValueError("has coordinates far outside the picture")
@@ -90,6 +92,8 @@ def _cropped(region: Region) -> Region:
 
 def connected(region: Region) -> list[Region]:
     """Return the connected parts (8 neighbours) of a region."""
+    if not region.mask.any():
+        return []  # OpenCV crashes on a picture without pixels
     count, label = cv2.connectedComponents(region.mask.astype(np.uint8))
     parts = [Region(left=region.left, top=region.top, mask=label == k) for k in range(1, count)]
     return [_cropped(part) for part in parts]

@@ -111,8 +111,8 @@ def _region(shape: Shape, picture: UserPicture) -> Region:
         return shape.region(picture.size)
     except ValueError as error:
         raise UsageError(
-            f"{picture.path}: {shape.name} {error} of {picture.size[1]}x{picture.size[0]};"
-            " correct or remove it"
+            f"{picture.path}: {shape.name} {error} ({picture.size[1]}x{picture.size[0]}); correct"
+            " or remove it"
         ) from error
 
 

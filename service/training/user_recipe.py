@@ -1,12 +1,14 @@
 """The recipe for a user's own labels: go on from the built-in weights, or begin anew."""
 
+import hashlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from canopy_skel.errors import UsageError
 from canopy_skel.segmenters.labels import LabelledImage
@@ -116,6 +118,7 @@ def user_weights(
     if init is not None:
         plan = replace(plan, channels=init.channels)
     state = None if init is None else init.network.state_dict()
+    plan = replace(plan, data=_digest(folder / "data" / "train", state))
     run = resume(plan, folder / "run") or start(plan, state)
     shown = validate if len(validate) else train_set
     look = Look(shown, range(min(len(shown), 20)))
@@ -124,6 +127,16 @@ def user_weights(
     facts["training"] |= {"pictures": len(train_set), "scans": imported.scans}
     save(output, model, facts)
     return imported, facts
+
+
+def _digest(labels: Path, state: Mapping[str, Tensor] | None) -> str:
+    """Return a SHA-256 over the stored labels and the weights to begin with."""
+    total = hashlib.sha256()
+    for path in sorted(labels.glob("*.labels.npz")):
+        total.update(path.read_bytes())
+    for name, value in sorted((state or {}).items()):
+        total.update(name.encode() + value.numpy().tobytes())
+    return total.hexdigest()
 
 
 def _finished(

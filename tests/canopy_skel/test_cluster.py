@@ -5,10 +5,11 @@ from hypothesis import strategies as st
 from oracles import naive_cluster
 
 from canopy_skel.cluster import ClusterConfig, cluster_branches, principal_axes
-from canopy_skel.errors import ViewError
+from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Intrinsics, View
 from canopy_skel.kernels.parts import shapes_of
 from canopy_skel.kernels.strip import measure
+from canopy_skel.pieces import PieceConfig
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
@@ -160,6 +161,34 @@ def test_a_blob_is_not_a_branch():
     clusters, rejected = clusters_of(depth_m, instances)
     assert clusters == []
     assert [r.reason for r in rejected] == ["not slender"]
+
+
+def test_what_fills_more_than_90_degrees_of_view_has_no_thickness():
+    """Beyond 1.27 focal lengths the formula of the outline turns negative."""
+    lens = Intrinsics(fx_px=25, fy_px=25, cx_px=160, cy_px=100, width_px=320, height_px=200)
+    instances = np.zeros((200, 320), np.uint16)
+    instances[70:130, 10:310] = 1
+    view = View(
+        index=0,
+        stamp_ns=0,
+        color_rgb=np.zeros((200, 320, 3), np.uint8),
+        intrinsics=lens,
+        base_from_camera=np.eye(4),
+        depth_m=np.full((200, 320), 0.4, np.float32),
+        instances=instances,
+        scores=(0.9,),
+    )
+    clusters, rejected = cluster_branches(view, RecordedSegmenter().segment(view), CONFIG)
+    assert clusters == []
+    assert [r.reason for r in rejected] == ["wider than 90 degrees"]
+
+
+@pytest.mark.parametrize("config", [ClusterConfig, PieceConfig])
+@pytest.mark.parametrize("nearest_m", [0.0, -1.0, np.nan, 3.0])
+def test_a_range_of_depth_begins_beyond_no_depth(config, nearest_m):
+    """A depth of 0 stands for none; its disparity would be infinite."""
+    with pytest.raises(UsageError, match="nearest above 0"):
+        config(nearest_m=nearest_m, farthest_m=3.0)
 
 
 def test_points_are_in_base():

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from service.kernels import PACKAGE, SELDOM, modules
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -24,11 +26,31 @@ def compiled(folder: Path) -> set[str]:
 
 
 def test_nothing_is_left_for_imports_to_compile(tmp_path):
-    assert "compiling the kernels, once" in run(tmp_path, "-m", "service.kernels")
+    start = "from service.kernels import compile_kernels; compile_kernels()"
+    assert "compiling the kernels, once" in run(tmp_path, "-c", start)
     before = compiled(tmp_path)
     assert len({name.split(".")[0] for name in before}) >= 12  # Modules.
-    run(tmp_path, "-c", "import canopy_skel.pipeline, canopy_skel.volume")
+    run(tmp_path, "-c", "import service.cli, service.worker")
     assert compiled(tmp_path) == before
+
+
+def test_installing_compiles_what_few_need_as_well():
+    seldom = {f"{PACKAGE}.{name}" for name in SELDOM}
+    assert len(seldom) == 3
+    assert set(modules()) - set(modules(SELDOM)) == seldom
+
+
+def test_all_kernels_say_what_types_they_take():
+    """Then importing compiles them, and the first view does not wait."""
+    script = (
+        "import importlib, sys\n"
+        "for name in sys.argv[1:]:\n"
+        "    module = importlib.import_module(name)\n"
+        "    for one in vars(module).values():\n"
+        "        if hasattr(one, 'py_func') and not one.signatures:\n"
+        "            sys.exit(f'{name}.{one.__name__} has no signature')\n"
+    )
+    subprocess.run([sys.executable, "-c", script, *modules()], cwd=ROOT, check=True)
 
 
 def test_a_second_start_compiles_nothing(tmp_path):

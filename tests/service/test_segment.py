@@ -203,6 +203,11 @@ def test_labels_judge_and_train(canopy, labelme, tmp_path, weights):
     assert any(not torch.equal(before[k], v) for k, v in model.network.state_dict().items())
     assert len(list((out / "data" / "train").glob("*.labels.npz"))) == 2
     assert len(list((out / "data" / "validate").glob("*.labels.npz"))) == 2
+    for path in labelme.glob("*.json"):
+        path.write_text(path.read_text().replace("width=", "width=1"))
+    code, _, stderr = canopy("train", *arguments)
+    assert code == 2
+    assert "checkpoint.pt: was trained on other labels, or began with other weights" in stderr
 
 
 @pytest.mark.parametrize(
@@ -221,6 +226,14 @@ def test_labels_judge_and_train(canopy, labelme, tmp_path, weights):
         (["train", "-o", "o", "--segmenter", "maskrcnn"], "unknown recipe 'builtin' for maskrcnn"),
         (["train", "-o", "o", "--segmenter", "eyes"], "unknown segmenter 'eyes'"),
         (["train", "-o", "o", "--labelme", "nowhere"], "nowhere: is not a folder"),
+        (["train", "-o", "o", "--labelme", "l", "--steps", "0"], "--steps 0: give more than 0"),
+        (["train", "-o", "o", "--minutes", "-1"], "--minutes -1.0: give more than 0"),
+        (["train", "-o", "o", "--minutes", "nan"], "--minutes nan: give more than 0"),
+        (["train", "-o", "o", "--scenes", "0"], "--scenes 0: give more than 0"),
+        (["train", "-o", "o", "--images", "i"], "go with labels: give --coco, --labelme"),
+        (["train", "-o", "o", "--init", "none"], "go with labels: give --coco, --labelme"),
+        (["segment", "--evaluate", "a.png"], "a.png: is a picture without labels; give them"),
+        (["segment", ".", "-o", "o"], ".: is a folder; name the pictures or recordings in it"),
     ],
 )
 def test_wrong_arguments_are_usage_errors(canopy, tmp_path, monkeypatch, arguments, says):

@@ -114,6 +114,21 @@ def test_a_run_of_another_plan_is_not_gone_on_with(images, tmp_path):
     longer = Plan(**{**loop.asdict(TINY), "steps": 99})
     assert resume(longer, tmp_path).plan.steps == 99
     assert resume(TINY, tmp_path / "nowhere") is None
+    with pytest.raises(UsageError, match="was trained on other labels, or began with other weigh"):
+        resume(replace(TINY, data="others"), tmp_path)
+
+
+@pytest.mark.parametrize("keep", [0, 100, 5000])
+def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, keep):
+    loop.save(start(TINY), tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(UsageError, match=r"checkpoint\.pt: is damaged; remove it") as refused:
+        resume(TINY, tmp_path)
+    assert "\n" not in str(refused.value)
+    torch.save({"other": 1}, path)
+    with pytest.raises(UsageError, match=r"checkpoint\.pt: is no checkpoint"):
+        resume(TINY, tmp_path)
 
 
 def test_without_pictures_there_is_no_training(tmp_path):

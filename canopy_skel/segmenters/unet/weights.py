@@ -3,11 +3,14 @@
 The JSON holds the file's SHA-256, which is compared before anything is unpickled.
 """
 
+import operator
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -25,6 +28,7 @@ from canopy_skel.segmenters.weight_files import (
 FORMAT = "canopy-unet/1"
 BUILTIN = Path(str(files(__package__) / "builtin.pt"))
 _MOST_BYTES = 64 << 20
+_MOST_CHANNELS = 4096
 _NEEDED = frozenset({"channels", "features", "grouping", "calibration", "least_score"})
 
 
@@ -68,7 +72,7 @@ def load(path: Path = BUILTIN) -> Model:
             f"{path}: its scores rest on other features than this version's; train anew, or use the"
             " version that wrote it"
         )
-    channels = tuple(description["channels"])
+    channels, grouping, calibration, least_score = _settings(path, description)
     network = UNet(channels)
     state = read_state(path, description["sha256"], _MOST_BYTES)
     require_fit(path, network.state_dict(), state)
@@ -76,13 +80,41 @@ def load(path: Path = BUILTIN) -> Model:
     return Model(
         network=network.eval(),
         channels=channels,
-        grouping=Grouping(**description["grouping"]),
-        calibration=Calibration(
-            weights=tuple(description["calibration"]["weights"]),
-            bias=description["calibration"]["bias"],
-        ),
-        least_score=description["least_score"],
+        grouping=grouping,
+        calibration=calibration,
+        least_score=least_score,
     )
+
+
+def _settings(
+    path: Path, description: Mapping[str, Any]
+) -> tuple[tuple[int, ...], Grouping, Calibration, float]:
+    """Return channels, grouping, calibration and least score that a description holds.
+
+    Raises:
+        UsageError: it holds something else.
+    """
+    try:
+        channels = tuple(map(operator.index, description["channels"]))
+        given = description["calibration"]
+        calibration = Calibration(weights=tuple(map(float, given["weights"])), bias=given["bias"])
+        least_score = float(description["least_score"])
+        if len(channels) < 2 or not 0 < min(channels) <= max(channels) <= _MOST_CHANNELS:
+            raise ValueError(f"{channels} are no channels")
+        if len(calibration.weights) != len(FEATURES):
+            raise ValueError(f"{len(calibration.weights)} weights for {len(FEATURES)} features")
+        grouping = Grouping(**description["grouping"])
+        numbers = [*asdict(grouping).values(), *calibration.weights, calibration.bias]
+        if not np.isfinite(numbers).all():
+            raise ValueError("not all numbers are finite")
+        if not 0 <= least_score <= 1:
+            raise ValueError(f"least_score is {least_score}, not from 0 to 1")
+        return channels, grouping, calibration, least_score
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(
+            f"{path.with_suffix('.json')}: does not say how the network is used ({error}); copy"
+            " both files anew"
+        ) from error
 
 
 def fused(network: UNet) -> UNet:

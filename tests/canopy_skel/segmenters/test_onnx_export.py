@@ -1,5 +1,7 @@
 """The exported network says what torch says, at any size."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,11 @@ from canopy_skel.segmenters.unet.network import UNet, normalised
 from canopy_skel.segmenters.unet.onnx_export import INPUT, OUTPUT, export_onnx
 from canopy_skel.segmenters.unet.weights import Model
 
-pytest.importorskip("onnx", reason="needs the extra `onnx`")
-onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
+
+@pytest.fixture
+def onnxruntime():
+    pytest.importorskip("onnx", reason="needs the extra `onnx`")
+    return pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
 
 
 @pytest.fixture
@@ -35,7 +40,7 @@ def model():
 
 
 @pytest.mark.filterwarnings("default")
-def test_onnxruntime_gives_the_maps_of_torch(model, tmp_path):
+def test_onnxruntime_gives_the_maps_of_torch(onnxruntime, model, tmp_path):
     export_onnx(model, tmp_path / "unet.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "unet.onnx")
     rng = np.random.default_rng(0)
@@ -49,6 +54,13 @@ def test_onnxruntime_gives_the_maps_of_torch(model, tmp_path):
         np.testing.assert_allclose(maps, expected, atol=2e-4)
 
 
+@pytest.mark.usefixtures("onnxruntime")
 def test_a_folder_that_is_not_there_is_named(model, tmp_path):
     with pytest.raises(UsageError, match=r"none/unet\.onnx: cannot be written"):
         export_onnx(model, tmp_path / "none" / "unet.onnx")
+
+
+def test_without_onnx_the_extra_is_named(model, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(UsageError, match=r"needs the extra `onnx`: pip install 'canopy-skel\[onnx"):
+        export_onnx(model, tmp_path / "unet.onnx")

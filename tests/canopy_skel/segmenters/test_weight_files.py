@@ -60,6 +60,13 @@ def test_code_and_other_objects_are_refused_even_with_a_right_digest(path, conte
     assert "must not run" not in capsys.readouterr().out
 
 
+def test_weights_of_a_training_that_diverged_are_refused(tmp_path):
+    for bad in (float("nan"), 1e9):  # Too large for float16, as which they are stored.
+        write_weights(tmp_path / "w.pt", {"a": torch.tensor([1.0, bad])}, {"format": "f/1"})
+        with pytest.raises(UsageError, match=r"w\.pt: a holds numbers that are none"):
+            read(tmp_path / "w.pt")
+
+
 def test_what_is_far_too_large_is_not_even_read(path):
     with pytest.raises(UsageError, match="is larger than 0 MiB"):
         read_state(path, None, 100)

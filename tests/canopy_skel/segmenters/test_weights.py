@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from canopy_skel.errors import UsageError
+from canopy_skel.segmenters.unet.features import FEATURES
 from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
 from canopy_skel.segmenters.unet.network import UNet, normalised
 from canopy_skel.segmenters.unet.weights import BUILTIN, Model, fused, load, save
@@ -20,7 +21,7 @@ def model():
         network=UNet(SMALL).eval(),
         channels=SMALL,
         grouping=Grouping(branch=0.6),
-        calibration=Calibration(weights=(1.0, 2.0, 3.0, 0.0, 0.5, -0.5), bias=-2.0),
+        calibration=Calibration(weights=tuple(map(float, range(len(FEATURES)))), bias=-2.0),
         least_score=0.3,
     )
 
@@ -104,6 +105,30 @@ def test_a_description_that_is_missing_old_or_short_is_named(saved):
     beside.unlink()
     with pytest.raises(UsageError, match=r"mine\.json: cannot be read"):
         load(saved)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"channels": []},
+        {"channels": "many"},
+        {"channels": [4, -6, 8]},
+        {"grouping": None},
+        {"grouping": {"sharpness": 1}},
+        {"grouping": {"branch": "0.4"}},
+        {"grouping": {"branch": float("nan")}},
+        {"calibration": {}},
+        {"calibration": {"weights": [1.0], "bias": 0.0}},
+        {"calibration": {"weights": [0.0] * len(FEATURES), "bias": None}},
+        {"least_score": None},
+        {"least_score": -5},
+    ],
+)
+def test_a_description_of_something_else_is_refused_in_one_line(saved, changes):
+    described(saved, **changes)
+    with pytest.raises(UsageError, match=r"mine\.json: does not say how the network is") as refused:
+        load(saved)
+    assert "\n" not in str(refused.value)
 
 
 def test_folding_normalisation_into_convolutions_changes_nothing(model):

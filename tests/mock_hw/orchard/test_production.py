@@ -14,12 +14,14 @@ from mock_hw.orchard.census import as_table, density_rows
 from mock_hw.orchard.dataset import (
     MANIFEST,
     LeafyTree,
+    Recorded,
     Settings,
     flaw_of,
     leafy_trees,
     read_manifest,
     recorded_in,
     sha256_of,
+    write_manifest,
 )
 from mock_hw.orchard.foliage import FoliageFit
 from mock_hw.orchard.production import produce
@@ -184,6 +186,29 @@ def test_a_manifest_that_is_none_is_named(tmp_path, text):
     (tmp_path / MANIFEST).write_text(text)
     with pytest.raises(UsageError, match=r"manifest.json: is no canopy-orchard/1 manifest"):
         run(tmp_path)
+
+
+def test_a_manifest_with_an_entry_of_another_type_is_named(tmp_path):
+    entry = Recorded(
+        file="walnut_003_fd1.mcap",
+        sha256="0",
+        bytes=1,
+        species="walnut",
+        topology=3,
+        foliage=1,
+        views=10,
+        leaf_count=5,
+        v_det=0.7,
+        v_det_target=0.7,
+        segmented=0.6,
+    )
+    write_manifest(tmp_path, [entry], SETTINGS, SOFTWARE)
+    manifest = read_manifest(tmp_path)
+    for name in asdict(entry):
+        entries = [{**manifest["recordings"][0], name: None}]
+        (tmp_path / MANIFEST).write_text(json.dumps({**manifest, "recordings": entries}))
+        with pytest.raises(UsageError, match=r"manifest.json: is no canopy-orchard/1 manifest"):
+            read_manifest(tmp_path)
 
 
 def test_a_killed_worker_is_one_clear_error(tmp_path, monkeypatch):

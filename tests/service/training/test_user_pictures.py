@@ -140,6 +140,27 @@ def test_parts_that_a_leaf_divides_are_instances_and_specks_are_ignored(folder):
     assert result.bent == ()
 
 
+@pytest.mark.parametrize(
+    "nothing",
+    [
+        {"segmentation": [[5.0, 5.0] * 3]},
+        {"segmentation": {"size": list(SIZE), "counts": [SIZE[0] * SIZE[1]]}},
+        {"bbox": [5, 5, 0, 0]},
+    ],
+)
+def test_a_shape_that_covers_no_pixel_is_nothing(folder, nothing):
+    image = first(folder([nothing, polygon(BAR)])).image
+    assert len(image.lines) == 1
+    assert not image.ignore.any()
+
+
+def test_a_line_wider_than_the_picture_is_refused(labelme):
+    line = {"points": [[10, 10], [90, 10]], "shape_type": "linestrip", "description": "99999"}
+    (picture,), _ = read_labelme(labelme([line]))
+    with pytest.raises(UsageError, match=r"a_0\.png: shape 1 has a width of 99999 pixels, more"):
+        labelled(picture)
+
+
 def test_the_smaller_of_two_that_overlap_is_in_front(folder):
     twig = [[5, 40], [120, 40], [120, 44], [5, 44]]
     for order in (1, -1):
@@ -198,10 +219,15 @@ def test_which_category_is_a_branch_can_be_chosen(folder):
         ([polygon(BAR)], {"images": [5]}, "not all images are objects"),
         ([polygon(BAR)], {"images": [{"id": 0}]}, "image 0 has file_name None"),
         ([polygon(BAR)], {"images": [{"id": 0, "file_name": "a_0.png"}]}, "width and height"),
+        ([polygon(BAR)], {"images": [{"id": 0}] * 2}, "an image has id 0 as another one has"),
         ([polygon(BAR[:2])], {}, "annotation 10 has a polygon that is none"),
         ([{"segmentation": [["x", 1, 2, 3, 4, 5]]}], {}, "annotation 10 has a polygon that is"),
         ([{"segmentation": {"counts": 5}}], {}, "annotation 10 has run lengths that are none"),
-        ([{"segmentation": {"counts": "5"}}], {}, "annotation 10 run lengths sum to 5, not to"),
+        (
+            [{"segmentation": {"counts": "5"}}],
+            {},
+            r"annotation 10 has run lengths of 5 pixels, not .* \(160x120\); correct",
+        ),
         ([polygon([[900, 1], [990, 1], [990, 9]])], {}, "annotation 10 has coordinates far outs"),
         ([polygon([[200, 1], [290, 1], [290, 9]])], {}, "annotation 10 lies outside the picture"),
         ([polygon([[float("nan"), 1], [9, 1], [9, 9]])], {}, "annotation 10 has coordinates far"),
@@ -314,6 +340,8 @@ def test_a_picture_within_the_file_is_used_where_its_own_is_gone(labelme):
         ({"points": "none"}, "shape 1 has points that are none"),
         ({"points": BAR, "shape_type": "linestrip"}, 'shape 1 is a linestrip without .*"width=12"'),
         ({"points": BAR, "label": "leaf"}, None),
+        ({"points": BAR, "label": ["branch"]}, None),
+        ({"points": BAR, "label": None}, None),
     ],
 )
 def test_a_bad_labelme_file_is_refused_in_one_line(labelme, shape, says):
