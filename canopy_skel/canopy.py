@@ -53,7 +53,7 @@ class CanopyConfig:
     extensions: ExtensionConfig = field(default_factory=ExtensionConfig)
     use_fragments: bool = True
     min_point: float = 0.5
-    min_fragment_point: float = 0.35
+    min_fragment_point: float = 0.6
     min_piece_m: float = 0.015
     rooted: bool = False
 

@@ -20,7 +20,7 @@ class ExtensionConfig:
 
     step_m: float = 0.005
     reach_m: float = 0.15
-    min_probability: float = 0.5
+    min_probability: float = 0.6
     min_fragment_probability: float = 0.8
     clear_m: float = 0.012
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from canopy_skel.assemble import free_ends
 from canopy_skel.canopy import CanopyScan, map_cost, vertex_features
-from canopy_skel.confidence import Logistic, Models, fit_logistic
+from canopy_skel.confidence import Depth, Logistic, Models, fit_logistic
 from canopy_skel.document import SkeletonDocument
 from canopy_skel.extend import rays_of
 from canopy_skel.fusion import Observed
@@ -24,11 +24,15 @@ LINK_SHARE = 0.8
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Lesson:
-    """One scan with its truth: positions on the true curve, a millimetre or so apart."""
+    """One scan with its truth: positions on the true curve, a millimetre or so apart.
+
+    depth: where that of its views comes from.
+    """
 
     scan: CanopyScan
     likelihood: LikelihoodMap
     truth: cKDTree
+    depth: Depth
 
     def cost(self, points: FloatArray) -> FloatArray:
         """Return -log p of the likelihood map at points (N, 3)."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from scipy.spatial import cKDTree
 
 from canopy_skel.canopy import CanopyConfig, CanopyScan
-from canopy_skel.confidence import Masks, Models
+from canopy_skel.confidence import Depth, Models, ModelSets
 from canopy_skel.document import from_json
 from canopy_skel.errors import RecordingError
 from canopy_skel.fitting import Lesson, fit_models, truth_points
@@ -97,20 +97,29 @@ def _lesson(
         seen = scan.observe(view, finder.segment(view), wood_of(finder, view))
         likelihood.add(segments_of(seen.splines))
         scan.add(view.index, seen)
-    return Lesson(scan=scan, likelihood=likelihood, truth=truth)
+    depth: Depth = "stereo" if any(view.matched for view in views) else "camera"
+    return Lesson(scan=scan, likelihood=likelihood, truth=truth, depth=depth)
 
 
 def fitted(
     lessons: Sequence[Sequence[Lesson]], names: Sequence[str], masks: Sequence[str]
-) -> dict[Masks, Models]:
-    """Fit to the `lessons_from` each scan; the first kind of masks are the recorded ones."""
+) -> ModelSets:
+    """Fit to the `lessons_from` each scan; the first kind of masks are the recorded ones.
+
+    Where no scan has one kind of depth, its models are fitted to the scans of the other.
+    """
     settings = MethodConfig(name="canopy").sha256()[:12]
 
-    def fit(kinds: Sequence[str]) -> Models:
+    def fit(kinds: Sequence[str], depth: Depth) -> Models:
+        chosen = [k for k, scan in enumerate(lessons) if scan[0].depth == depth]
+        chosen = chosen or list(range(len(lessons)))
         return fit_models(
-            [lesson for scan in lessons for lesson in scan[: len(kinds) + 1]],
-            f"fitted to {len(names)} scans (masks {', '.join(kinds)}; settings {settings}):"
-            f" {', '.join(names)}",
+            [lesson for k in chosen for lesson in lessons[k][: len(kinds) + 1]],
+            f"fitted to {len(chosen)} scans (masks {', '.join(kinds)}; settings {settings}):"
+            f" {', '.join(names[k] for k in chosen)}",
         )
 
-    return {"recorded": fit(masks[:1]), "learned": fit(masks)}
+    def both(kinds: Sequence[str]) -> dict[Depth, Models]:
+        return {"camera": fit(kinds, "camera"), "stereo": fit(kinds, "stereo")}
+
+    return {"recorded": both(masks[:1]), "learned": both(masks)}

@@ -52,11 +52,13 @@ def fit_confidence(
             progress.advance(task)
     models = fitted(lessons, [path.stem for path in sorted(recordings)], masks)
     output.write_bytes(models_to(models))
-    for kind, one in models.items():
-        stderr.print(f"{output}, {kind}: {one.provenance}", markup=False)
+    for kind, by_depth in models.items():
+        for depth, one in by_depth.items():
+            stderr.print(f"{output}, {kind}, {depth}: {one.provenance}", markup=False)
     for path in held_out or []:
         for name in masks:
-            chosen = models["recorded" if name == "recorded" else "learned"]
-            row = reliability(lesson_from(path, name), chosen)
+            lesson = lesson_from(path, name)
+            chosen = models["recorded" if name == "recorded" else "learned"][lesson.depth]
+            row = reliability(lesson, chosen)
             figures = " ".join(f"{model} {value:.3f}" for model, value in row.items())
             typer.echo(f"{path.stem}, {name}: {figures}")

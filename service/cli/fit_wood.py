@@ -29,5 +29,7 @@ def fit_wood(
     if output.is_dir():
         raise UsageError(f"{output} is a folder; name the JSON file to write")
     model = pixel_model_of(recordings, MASKS)
+    if model is None:
+        raise UsageError("no view has a depth image, stereo pairs only; add scans that have them")
     output.write_bytes(pixel_model_to(model))
     stderr.print(f"{output}: {model.provenance}", markup=False)
