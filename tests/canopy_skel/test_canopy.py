@@ -489,7 +489,7 @@ def test_a_row_has_the_same_probability_alone_and_among_others():
 def test_models_survive_being_written():
     models = shipped_models()
     assert models_from(json.loads(models_to(models))) == models
-    assert all(one.provenance for one in models.values())
+    assert all(one.provenance for by_depth in models.values() for one in by_depth.values())
 
 
 def test_masks_of_a_network_are_believed_less_than_recorded_ones(views):
@@ -505,6 +505,21 @@ def test_masks_of_a_network_are_believed_less_than_recorded_ones(views):
         trusting.add_view(view)
         wary.add_view(view)
     assert wary.skeleton().graph.confidence.mean() < trusting.skeleton().graph.confidence.mean()
+
+
+def test_matched_depth_has_models_of_its_own_whatever_the_order(views):
+    def confidence(views, models=None):
+        maker = Skeletonizer(RecordedSegmenter(), MethodConfig(name="canopy"), models=models)
+        for view in views:
+            maker.add_view(view)
+        return maker.skeleton().graph.confidence.tobytes()
+
+    shipped = models_for(RecordedSegmenter())
+    assert shipped["stereo"] != shipped["camera"]
+    matched = [replace(views[0], matched=True), *views[1:]]
+    as_stereo = confidence(views, {"camera": shipped["stereo"], "stereo": shipped["stereo"]})
+    assert confidence(matched) == confidence(matched[::-1]) == as_stereo
+    assert confidence(views) != as_stereo
 
 
 def test_a_false_mask_is_false_as_a_whole():
