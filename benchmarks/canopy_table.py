@@ -86,7 +86,8 @@ on other trees (the models' file names them; no walnut is among them). Columns a
 [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it, without
 segmentation, on a busy machine. The number behind a recording is the share of its truth that no
 mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated
-ones; fragments are found by colour, and simulated colours are not an orchard's: the rows "masks
+ones; fragments are told by colour and by what lies around each pixel, and simulated colours are not
+an orchard's: the rows "masks
 only" do not depend on them. Rows with *worse masks* (a quarter dropped, a fifth false) and with the
 masks of the built-in *unet* show what a real detector would leave of it; they use the confidences
 for learned masks. Depth counts up to 3 m, so trees of the next row do not.

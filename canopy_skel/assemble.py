@@ -12,7 +12,7 @@ from canopy_skel.fusion import Observed
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.likelihood import LikelihoodMap
-from canopy_skel.links import Candidates, Parts, accepted, candidates_of, possible
+from canopy_skel.links import Candidates, Parts, Places, candidates_of, links_to_make, places_on
 from canopy_skel.poses import PoseCorrection
 
 TAIL_CONFIDENCE = 0.1
@@ -39,19 +39,14 @@ def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> 
         return map_cost(likelihood, points)
 
     candidates = candidates_of(parts, scan.evidence, cost, config.links)
-    probability = possible(candidates, models.link(candidates.features), config.links.max_empty)
-    made = accepted(
-        candidates,
-        probability,
-        parts.component,
-        parts.component[parts.ends.vertex],
-        config.links.min_probability,
-    )
+    probability = models.link(candidates.features)
+    made = links_to_make(parts, candidates, probability, config.links)
+    places = places_on(candidates, made, probability, config.links.spacing_m)
     free = free_ends(parts, candidates, made)
     rays = rays_of(parts, free, scan.evidence, cost, config.extensions)
     steps = extension_probability(models, rays)
     graph = _observed_graph(parts, observed)
-    graph = with_links(graph, candidates, made, probability[made], parts, config.links.spacing_m)
+    graph = with_links(graph, candidates, made, places, models.joint(places.features), parts)
     graph = with_extensions(
         graph, rays, lengths(rays, parts, steps, config.extensions), steps, parts
     )
@@ -93,23 +88,22 @@ def with_links(
     graph: SkeletonGraph,
     candidates: Candidates,
     made: IntArray,
-    probability: FloatArray,
+    places: Places,
+    confidence: FloatArray,
     parts: Parts,
-    spacing_m: float,
 ) -> SkeletonGraph:
-    """Add links as chains of vertices, as thick as the thinner of their ends."""
+    """Add links as chains of vertices at their places, as thick as the thinner of their ends."""
     chains = []
-    for i, p in zip(made.tolist(), probability.tolist(), strict=True):
+    for k, i in enumerate(made.tolist()):
         a, b = int(parts.ends.vertex[candidates.end[i]]), int(candidates.vertex[i])
-        radius_m = min(graph.radius_m[a], graph.radius_m[b])
-        inner = evenly(candidates.curves[i], spacing_m)[1:-1]
+        own = slice(places.first[k], places.first[k + 1])
         chains.append(
             Chain(
                 start=a,
                 goal=b,
-                points=inner,
-                radius_m=radius_m,
-                confidence=np.full(len(inner), p),
+                points=places.points[own],
+                radius_m=min(graph.radius_m[a], graph.radius_m[b]),
+                confidence=confidence[own],
                 source=LINK,
             )
         )
@@ -188,10 +182,3 @@ def sources_of(graph: SkeletonGraph) -> IntArray:
     if graph.source is None:
         return np.zeros(len(graph.vertices_in_base), dtype=np.int64)
     return graph.source
-
-
-def evenly(curve: FloatArray, spacing_m: float) -> FloatArray:
-    """Return points on a polyline (n, 3), both ends included, no further apart than `spacing_m`."""
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
-    at = np.linspace(0.0, length[-1], max(2, int(np.ceil(length[-1] / spacing_m)) + 1))
-    return np.column_stack([np.interp(at, length, column) for column in curve.T])

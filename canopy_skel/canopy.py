@@ -26,7 +26,9 @@ from canopy_skel.observe import Observation, observe
 from canopy_skel.pieces import PieceConfig
 from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
 from canopy_skel.segment import BranchMask
+from canopy_skel.slivers import inside_thicker
 from canopy_skel.wood import FragmentConfig
+from canopy_skel.woodpixels import PixelModel
 
 POINT_FEATURES = 46
 NO_MAP_NATS = 12.0
@@ -78,10 +80,14 @@ def canopy_config_from(fields: Mapping[str, Any]) -> CanopyConfig:
 
 
 class CanopyScan:
-    """The views of one scan, in any order, and the skeleton of all so far."""
+    """The views of one scan, in any order, and the skeleton of all so far.
 
-    def __init__(self, config: CanopyConfig) -> None:
+    pixel_model: what tells wood beside the masks; None: the one that is shipped.
+    """
+
+    def __init__(self, config: CanopyConfig, pixel_model: PixelModel | None = None) -> None:
         self.config = config
+        self._pixel_model = pixel_model
         self._seen: dict[int, Observation] = {}
         self._counts: dict[int, IntArray] = {}
         self._agreed: dict[int, IntArray] = {}
@@ -94,7 +100,9 @@ class CanopyScan:
         `probability` (H, W): of wood, where a detector gives it; without, colour has to do.
         """
         fragments = self.config.fragments if self.config.use_fragments else None
-        return observe(view, list(masks), self.config.pieces, fragments, probability)
+        return observe(
+            view, list(masks), self.config.pieces, fragments, probability, self._pixel_model
+        )
 
     def add(self, index: int, seen: Observation) -> None:
         """Take a view in: all points are asked in it, and its points in all views."""
@@ -148,15 +156,15 @@ class CanopyScan:
             fragment, models.fragment_point(features), models.instance_point(features)
         )
         limit = np.where(fragment, self.config.min_fragment_point, self.config.min_point)
-        kept = probability >= limit
         seen = Observations(
-            points_in_base=points[kept],
-            directions=directions[kept],
-            radius_m=radius_m[kept],
-            probability=probability[kept],
-            view=view[kept],
-            fragment=fragment[kept],
-        )
+            points_in_base=points,
+            directions=directions,
+            radius_m=radius_m,
+            probability=probability,
+            view=view,
+            fragment=fragment,
+        ).chosen(probability >= limit)
+        seen = seen.chosen(~inside_thicker(seen))
         fused = fuse(seen, self.config.fusion)
         corrections = pose_corrections(seen, fused, self.config.poses)
         if corrections:

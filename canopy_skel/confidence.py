@@ -1,7 +1,7 @@
 """Probabilities that mean what they say: logistic models, fitted on simulated trees."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
@@ -15,6 +15,8 @@ from canopy_skel.geometry import FloatArray
 MODELS_FILE = "canopy-confidence.json"
 Masks = Literal["recorded", "learned"]
 """Where masks come from: recorded beside the pictures and hardly ever wrong, or from a network."""
+Depth = Literal["camera", "stereo"]
+"""Where depth comes from: measured by the camera, or matched from its stereo pairs."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,19 +69,29 @@ def fit_logistic(features: FloatArray, right: ArrayLike, ridge: float = 1.0) -> 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Models:
-    """All models of mode `canopy`, by what they judge, and where they come from."""
+    """All models of mode `canopy`, by what they judge, and where they come from.
+
+    link judges a possible link as a whole, joint a place on a link that was made.
+    """
 
     instance_point: Logistic
     fragment_point: Logistic
     vertex: Logistic
     link: Logistic
+    joint: Logistic
     extension: Logistic
     provenance: str
 
 
-def models_from(value: Mapping[str, Any]) -> dict[Masks, Models]:
+ModelSets = Mapping[Masks, Mapping[Depth, Models]]
+
+
+def models_from(value: Mapping[str, Any]) -> ModelSets:
     """Return the models that `models_to` wrote."""
-    return {masks: _one_from(value[masks]) for masks in get_args(Masks)}
+    return {
+        masks: {depth: _one_from(value[masks][depth]) for depth in get_args(Depth)}
+        for masks in get_args(Masks)
+    }
 
 
 def _one_from(value: Mapping[str, Any]) -> Models:
@@ -98,16 +110,24 @@ def _one_from(value: Mapping[str, Any]) -> Models:
     )
 
 
-def models_to(models: Mapping[Masks, Models]) -> bytes:
-    """Return the models for each kind of masks as JSON, one line per model."""
-    sets = []
-    for masks, one in models.items():
-        lines = (f"{json.dumps(name)}: {json.dumps(value)}" for name, value in asdict(one).items())
-        sets.append(f"{json.dumps(masks)}: {{\n " + ",\n ".join(lines) + "}")
-    return ("{" + ",\n".join(sets) + "}\n").encode()
+def models_to(models: ModelSets) -> bytes:
+    """Return the models for each kind of masks and of depth as JSON, one line per model."""
+
+    def lines_of(one: Models) -> str:
+        return _braced([(name, json.dumps(value)) for name, value in asdict(one).items()])
+
+    kinds = [
+        (masks, _braced([(depth, lines_of(one)) for depth, one in by_depth.items()]))
+        for masks, by_depth in models.items()
+    ]
+    return (_braced(kinds) + "\n").encode()
+
+
+def _braced(items: Sequence[tuple[str, str]]) -> str:
+    return "{" + ",\n ".join(f"{json.dumps(name)}: {text}" for name, text in items) + "}"
 
 
 @cache
-def shipped_models() -> dict[Masks, Models]:
-    """Return the models this package ships, by where masks come from."""
+def shipped_models() -> ModelSets:
+    """Return the models this package ships, by where masks and depth come from."""
     return models_from(json.loads((files("canopy_skel") / "models" / MODELS_FILE).read_text()))

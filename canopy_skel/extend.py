@@ -21,7 +21,7 @@ class ExtensionConfig:
     step_m: float = 0.005
     reach_m: float = 0.15
     min_probability: float = 0.6
-    min_fragment_probability: float = 0.7
+    min_fragment_probability: float = 0.8
     clear_m: float = 0.012
 
 
@@ -53,6 +53,12 @@ def rays_of(
     empty = is_empty(counts).reshape(shape)
     nats = cost(flat).reshape(shape)
     far = np.arange(1, steps + 1)
+    shares = {
+        code: np.cumsum((counts[:, code] > 0).reshape(shape), axis=1) / far
+        for code in (WOOD, LEAF, HIDDEN, THROUGH, BACKGROUND)
+    }
+    # Where leaves hide little of a tree, its ends are tips: what all rays meet tells that.
+    leafy = float(shares[LEAF][:, -1].mean()) if len(chosen) else 0.0
     own = np.column_stack(
         [
             parts.confidence[start],
@@ -60,15 +66,14 @@ def rays_of(
             np.log(ends.behind_m[chosen] + 0.005),
             np.log(parts.length_m[start] + 0.01),
             ends.tangents[chosen][:, 2],
+            shares[THROUGH][:, -1],
+            np.full(len(chosen), leafy),
         ]
     )
     along = [
         np.broadcast_to(length, shape),
         np.broadcast_to(np.sqrt(length), shape),
-        *(
-            np.cumsum((counts[:, code] > 0).reshape(shape), axis=1) / far
-            for code in (WOOD, LEAF, HIDDEN, THROUGH, BACKGROUND)
-        ),
+        *shares.values(),
         nats,
         np.cumsum(nats, axis=1) / far,
     ]

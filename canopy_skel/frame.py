@@ -57,7 +57,8 @@ class View:
 
     index: place in the scan (0, 1, …). stamp_ns: exposure time, int nanoseconds.
     color_rgb: (H, W, 3) uint8, undistorted. depth_m: (H, W) float32 aligned to colour,
-    NaN = no return; None while only the stereo pair is known.
+    NaN = no return; None while only the stereo pair is known. matched: the depth was matched here
+    from the stereo pair, not measured by the camera.
     base_from_camera: (4, 4), maps points of the camera's optical frame into base.
     instances: (H, W) uint16, 0 = none, i = branch instance i; scores: confidence of instance
     i at scores[i - 1]; both None where nobody segmented the view.
@@ -73,6 +74,7 @@ class View:
     base_from_camera: FloatArray
     depth_m: Float32Array | None = None
     stereo: StereoPair | None = None
+    matched: bool = False
     instances: UInt16Array | None = None
     scores: tuple[float, ...] | None = None
 

@@ -20,13 +20,15 @@ Cost = Callable[[FloatArray], FloatArray]
 class LinkConfig:
     """Links of at most `reach_m` and of probability at least `min_probability` are made.
 
-    A link more than `max_empty` of which runs where nothing can be is not made, whatever its
-    probability. Of each end the `candidates` best are asked; curves are drawn every `spacing_m`.
+    To or from a fragment, whose direction is less sure, `min_fragment_probability` counts. A link
+    more than `max_empty` of which runs where nothing can be is not made, whatever its probability.
+    Of each end the `candidates` best are asked; curves are drawn every `spacing_m`.
     """
 
     reach_m: float = 0.25
     max_empty: float = 0.3
-    min_probability: float = 0.4
+    min_probability: float = 0.3
+    min_fragment_probability: float = 0.5
     candidates: int = 6
     spacing_m: float = 0.008
 
@@ -35,7 +37,8 @@ class LinkConfig:
 class Candidates:
     """Possible links: from end `end` to vertex `vertex`, at its end `other` or (-1) at its side.
 
-    curves: (L, n, 3) points on each, both ends included; features: (L, F).
+    curves: (L, n, 3) points on each, both ends included; features: (L, F), figures and their
+    squares.
     """
 
     end: IntArray
@@ -43,6 +46,18 @@ class Candidates:
     other: IntArray
     curves: FloatArray
     features: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Places:
+    """Places on links that were made, in rows: points (N, 3), features (N, F).
+
+    first: (L + 1,) the places on link k are first[k] : first[k + 1].
+    """
+
+    points: FloatArray
+    features: FloatArray
+    first: IntArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -66,6 +81,9 @@ class Parts:
 _SAMPLES = 17
 _EMPTY_SHARE = 6
 """Its column among the features of a link."""
+_LIPS = slice(15, 17)
+"""The confidences of what it joins."""
+_PLACE_FEATURES = 5
 
 
 def candidates_of(
@@ -132,7 +150,8 @@ def _features(
     counts = evidence(inner)
     shares = _shares(counts, len(end))
     nats = cost(inner).reshape(len(end), _SAMPLES - 2)
-    return np.column_stack(
+    radii = np.log(np.maximum(parts.radius_m, 1e-4))
+    figures = np.column_stack(
         [
             np.log(length + 0.005),
             length,
@@ -147,11 +166,13 @@ def _features(
             np.log(parts.length_m[vertex] + 0.01),
             parts.confidence[start],
             parts.confidence[vertex],
-            np.log(np.maximum(parts.radius_m[start], 1e-4)),
-            np.log(np.maximum(parts.radius_m[vertex], 1e-4)),
+            radii[start],
+            radii[vertex],
             np.log(rank + 0.005),
+            np.abs(radii[start] - radii[vertex]),
         ]
     )
+    return np.column_stack([figures, figures**2])
 
 
 def _shares(counts: IntArray, links: int) -> FloatArray:
@@ -168,21 +189,30 @@ def _shares(counts: IntArray, links: int) -> FloatArray:
     return np.asarray(flags.reshape(links, _SAMPLES - 2, 5).mean(axis=1))
 
 
-def possible(candidates: Candidates, probability: FloatArray, max_empty: float) -> FloatArray:
-    """Return the probabilities (L,), 0 of links through places that were seen to be empty."""
-    return np.where(candidates.features[:, _EMPTY_SHARE] > max_empty, 0.0, probability)
+def links_to_make(
+    parts: Parts, candidates: Candidates, probability: FloatArray, config: LinkConfig
+) -> IntArray:
+    """Return which candidates become links, of their probabilities (L,)."""
+    of_end = parts.ends.vertex
+    fragment = parts.fragment[of_end[candidates.end]] | parts.fragment[candidates.vertex]
+    limit = np.where(fragment, config.min_fragment_probability, config.min_probability)
+    allowed = probability >= limit
+    allowed &= candidates.features[:, _EMPTY_SHARE] <= config.max_empty
+    return forest_of(candidates, probability, allowed, parts.component, parts.component[of_end])
 
 
-def accepted(
+def forest_of(
     candidates: Candidates,
     probability: FloatArray,
+    allowed: BoolArray,
     component: IntArray,
     of_end: IntArray,
-    min_probability: float,
 ) -> IntArray:
-    """Return the links to make: Kruskal on falling probability, each end used once.
+    """Return which of the allowed links (L,) are made: Kruskal on falling probability.
 
-    Independent links given, that is the most likely forest. Ties fall by gap, then by number.
+    component: (V,); of_end: (K,), the component of each end. Independent links given, that is the
+    most likely forest. An end may have several: behind the leaves it may fork. Ties fall by gap,
+    then by number.
     """
     parent = list(range(int(component.max(initial=-1)) + 1))
 
@@ -193,20 +223,43 @@ def accepted(
         return c
 
     order = np.lexsort((candidates.features[:, 1], -probability))
-    used: set[int] = set()
     chosen = []
-    for i in order.tolist():
-        if probability[i] < min_probability:
-            break
-        end, other = int(candidates.end[i]), int(candidates.other[i])
-        if end in used or other in used:
-            continue
-        from_vertex = int(candidates.vertex[i])
-        a = root(int(of_end[end]))
-        b = root(int(component[from_vertex]))
-        if a == b:
-            continue
-        parent[a] = b
-        used |= {end} | ({other} if other >= 0 else set())
-        chosen.append(i)
+    for i in order[allowed[order]].tolist():
+        a = root(int(of_end[candidates.end[i]]))
+        b = root(int(component[candidates.vertex[i]]))
+        if a != b:
+            parent[a] = b
+            chosen.append(i)
     return np.array(chosen, dtype=np.int64)
+
+
+def places_on(
+    candidates: Candidates, made: IntArray, probability: FloatArray, spacing_m: float
+) -> Places:
+    """Return the inner places on the links made, of the probabilities (L,) of all candidates.
+
+    A link was chosen from many, and may be right at its lips and wrong in its middle: so a place
+    has a probability of its own.
+    """
+    points, features = [np.zeros((0, 3))], [np.zeros((0, _PLACE_FEATURES))]
+    for i in made.tolist():
+        inner, length_m = evenly(candidates.curves[i], spacing_m)
+        gone_m = length_m * np.arange(1, len(inner) + 1) / (len(inner) + 1)
+        lips_m = np.sort(np.column_stack([gone_m, length_m - gone_m]), axis=1)
+        p = min(max(float(probability[i]), 1e-3), 1.0 - 1e-3)
+        of_link = [np.log(p / (1.0 - p)), *candidates.features[i, _LIPS]]
+        points.append(inner)
+        features.append(np.column_stack([np.tile(of_link, (len(inner), 1)), lips_m]))
+    return Places(
+        points=np.concatenate(points),
+        features=np.concatenate(features),
+        first=np.cumsum([len(row) for row in points]),
+    )
+
+
+def evenly(curve: FloatArray, spacing_m: float) -> tuple[FloatArray, float]:
+    """Return points within a polyline (n, 3), no further apart than `spacing_m`, and its length."""
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+    count = max(2, int(np.ceil(length[-1] / spacing_m)) + 1)
+    at = np.linspace(0.0, length[-1], count)[1:-1]
+    return np.column_stack([np.interp(at, length, column) for column in curve.T]), length[-1]

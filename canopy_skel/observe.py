@@ -7,6 +7,7 @@ import numpy as np
 from canopy_skel.evidence import ViewEvidence, evidence_of
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.kernels import profile
 from canopy_skel.kernels.agree import agreement
 from canopy_skel.kernels.fuse import cell_keys
 from canopy_skel.pieces import (
@@ -22,10 +23,11 @@ from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import (
     FragmentConfig,
     at_tree,
-    colour_wood_probability,
     fragments_of,
     mask_image,
+    wood_probability,
 )
+from canopy_skel.woodpixels import PixelModel, shipped_pixel_model
 
 SAMPLE_M = 0.005
 _NEAR_M = 0.02
@@ -82,11 +84,12 @@ def observe(
     pieces_config: PieceConfig,
     fragments_config: FragmentConfig | None,
     probability: Float32Array | None = None,
+    pixel_model: PixelModel | None = None,
 ) -> Observation:
     """Lift the masks of a view, and the fragments beside them, into base.
 
-    `probability` (H, W): of wood, from a detector; None: by colour. `fragments_config` None: no
-    fragments.
+    `probability` (H, W): of wood, from a detector; None: by colour and `pixel_model`, without one
+    that which is shipped. `fragments_config` None: no fragments.
 
     Raises:
         ViewError: the view has no depth.
@@ -99,11 +102,14 @@ def observe(
         wood &= ~(depth_of(view) > pieces_config.farthest_m)
     if fragments_config is not None:
         if probability is None:
-            probability = colour_wood_probability(view, wood, fragments_config)
+            limit = fragments_config.min_probability
+            model = pixel_model or shipped_pixel_model()
+            probability = wood_probability(view, wood, fragments_config, model)
         else:
+            limit = fragments_config.min_detected
             outside = at_tree(view, wood, fragments_config) & ~wood
             probability = np.where(outside, probability, np.float32(0))
-        fragments = fragments_of(probability, fragments_config)
+        fragments = fragments_of(probability, limit, fragments_config)
         pieces += pieces_of(view, fragments, pieces_config, fragments=True)
         wood[fragments.v, fragments.u] = True
     points, directions, of = sampled(pieces)
@@ -118,41 +124,36 @@ def observe(
         piece=of,
         radius_m=np.array([p.spline.radius_m for p in pieces])[of],
         fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
-        quality=np.array([_quality(p) for p in pieces]).reshape(-1, 8)[of],
+        quality=_quality(pieces)[of],
         evidence=evidence_of(view, wood),
         cells=cells[by_cell],
         by_cell=by_cell,
     )
 
 
-def _quality(piece: Piece) -> list[float]:
-    pixels, length_px, width_px, valid, inlier, lateral = piece.quality.tolist()
-    return [
-        piece.spline.confidence,
-        float(np.log(pixels)),
-        float(np.log(length_px / width_px)),
-        float(np.log(width_px)),
-        valid,
-        inlier,
-        lateral,
-        float(np.log(piece.spline.radius_m * 0.5 * width_px / half_width_px(piece.quality))),
-    ]
+def _quality(pieces: list[Piece]) -> FloatArray:
+    """Return the figures (R, 8) by which pieces are judged; see `Observation`."""
+    if not pieces:
+        return np.zeros((0, 8))
+    quality = np.array([piece.quality for piece in pieces])
+    pixels, length_px, width_px, valid, inlier, lateral = quality.T
+    radius_m = np.array([piece.spline.radius_m for piece in pieces])
+    return np.column_stack(
+        [
+            [piece.spline.confidence for piece in pieces],
+            np.log(pixels),
+            np.log(length_px / width_px),
+            np.log(width_px),
+            valid,
+            inlier,
+            lateral,
+            np.log(radius_m * 0.5 * width_px / half_width_px(quality)),
+        ]
+    )
 
 
 def sampled(pieces: list[Piece]) -> tuple[FloatArray, FloatArray, np.ndarray]:
     """Return points every `SAMPLE_M` along the pieces, unit directions, and the piece of each."""
-    points, directions, of = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
-    for number, piece in enumerate(pieces):
-        knots = piece.spline.control_points_in_base
-        steps = np.diff(knots, axis=0)
-        length = np.linalg.norm(steps, axis=1)
-        way = np.append(0.0, np.cumsum(length))
-        if way[-1] < 1e-6:
-            continue
-        at = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / SAMPLE_M)) + 1))
-        which = np.clip(np.searchsorted(way, at, side="right") - 1, 0, len(length) - 1)
-        unit = steps / np.maximum(length, 1e-12)[:, None]
-        points.append(knots[which] + (at - way[which])[:, None] * unit[which])
-        directions.append(unit[which])
-        of.append(np.full(len(at), number))
-    return np.concatenate(points), np.concatenate(directions), np.concatenate(of)
+    lines = [piece.spline.control_points_in_base for piece in pieces]
+    start = np.cumsum([0, *(len(line) for line in lines)])
+    return profile.sample_lines(np.concatenate([np.zeros((0, 3)), *lines]), start, SAMPLE_M)

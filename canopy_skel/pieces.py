@@ -110,33 +110,55 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         config.tolerance_m,
         config.min_valid_share,
     )
-    thickest_m = config.thickest_fragment_m if fragments else config.thickest_m
-    pieces = []
-    for i in np.flatnonzero(counts).tolist():
-        u, v, disparity = knots[i, : counts[i]].T
-        points = camera.back_project(u, v, 1.0 / disparity)
-        radius_m = half_width_px(quality[i]) / camera.fx_px / float(disparity.mean())
-        if radius_m > thickest_m:
-            continue
-        points = points + config.centre_shift * radius_m * away_across(points)
-        spline = BranchSpline(
-            view_index=view.index,
-            instance=int(regions.numbers[i]),
-            confidence=float(regions.confidence[i]),
-            radius_m=radius_m,
-            control_points_in_base=transform_points(view.base_from_camera, points),
+    kept, radius_m, points = _lifted(view, counts, knots, quality, config, fragments=fragments)
+    return [
+        Piece(
+            spline=BranchSpline(
+                view_index=view.index,
+                instance=int(regions.numbers[i]),
+                confidence=float(regions.confidence[i]),
+                radius_m=float(radius),
+                control_points_in_base=line[: counts[i]],
+            ),
+            fragment=fragments,
+            quality=quality[i],
         )
-        pieces.append(Piece(spline=spline, fragment=fragments, quality=quality[i]))
-    return pieces
+        for i, radius, line in zip(kept.tolist(), radius_m, points, strict=True)
+    ]
 
 
-def half_width_px(quality: FloatArray) -> float:
-    """Return the half width of an even strip of pixels with this deviation from its middle.
+def _lifted(
+    view: View,
+    counts: IntArray,
+    knots: FloatArray,
+    quality: FloatArray,
+    config: PieceConfig,
+    *,
+    fragments: bool,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return which regions are no thicker than a branch, their radii (R,), and knots in base."""
+    kept = np.flatnonzero(counts)
+    u, v, disparity = np.moveaxis(knots[kept], 2, 0)
+    has = np.arange(knots.shape[1]) < counts[kept, None]
+    mean_disparity = np.sum(disparity, axis=1, where=has) / counts[kept]
+    radius_m = half_width_px(quality[kept]) / view.intrinsics.fx_px / mean_disparity
+    slender = radius_m <= (config.thickest_fragment_m if fragments else config.thickest_m)
+    kept, radius_m, has = kept[slender], radius_m[slender], has[slender]
+    depth_m = 1.0 / np.where(has, disparity[slender], 1.0)
+    points = view.intrinsics.back_project(u[slender].ravel(), v[slender].ravel(), depth_m.ravel())
+    points = points.reshape(*has.shape, 3)
+    profile.shift_away(points, counts[kept], config.centre_shift * radius_m)
+    in_base = transform_points(view.base_from_camera, points.reshape(-1, 3)).reshape(points.shape)
+    return kept, radius_m, in_base
+
+
+def half_width_px(quality: FloatArray) -> FloatArray:
+    """Return half the width (R,) of even strips of pixels that deviate so from their middle.
 
     Area over length would be too thin where leaves cut pieces out of the strip.
     """
-    deviation_px = quality[5] * quality[2]
-    return float(np.sqrt(3.0 * (deviation_px**2 + 1.0 / 12.0)))
+    deviation_px = quality[..., 5] * quality[..., 2]
+    return np.asarray(np.sqrt(3.0 * (deviation_px**2 + 1.0 / 12.0)))
 
 
 def depth_of(view: View) -> Float32Array:
@@ -154,13 +176,3 @@ def usable_depth(depth_m: Float32Array, config: PieceConfig) -> Float32Array:
     """Return the depth with NaN where it is out of range."""
     inside = (depth_m >= config.nearest_m) & (depth_m <= config.farthest_m)
     return np.where(inside, depth_m, np.float32(np.nan))
-
-
-def away_across(points: FloatArray) -> FloatArray:
-    """Return for knots (n, 3) in the camera frame the unit way from the camera across the line."""
-    along = np.gradient(points, axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
-    across = ray - np.sum(ray * along, axis=1, keepdims=True) * along
-    norm = np.linalg.norm(across, axis=1, keepdims=True)
-    return np.where(norm > 0.05, across / np.maximum(norm, 0.05), 0.0)

@@ -1,7 +1,7 @@
 """Views in, one growing likelihood map, a skeleton out: the whole method in the paper's order."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -14,7 +14,7 @@ from canopy_skel.baselines.ftsem import FtsemConfig, join_break_points
 from canopy_skel.baselines.mst import join_by_spanning_tree
 from canopy_skel.canopy import CanopyConfig, CanopyScan
 from canopy_skel.cluster import ClusterConfig, RejectedInstance, cluster_branches
-from canopy_skel.confidence import Models, shipped_models
+from canopy_skel.confidence import Depth, Models, shipped_models
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
@@ -92,16 +92,18 @@ class _Known:
     """What is kept of a view. shown: how many pieces of wood it shows."""
 
     camera_in_base: FloatArray
+    matched: bool
     splines: list[BranchSpline]
     shown: int
     instances: int
     rejected: list[RejectedInstance]
 
 
-def models_for(segmenter: Segmenter) -> Models:
+def models_for(segmenter: Segmenter) -> Mapping[Depth, Models]:
     """Return the shipped confidences of method `canopy` that suit a segmenter's masks.
 
-    Recorded masks are believed more than those of any network.
+    Recorded masks are believed more than those of any network, and for each there are models for
+    depth that the camera measured and for depth that was matched from stereo pairs.
     """
     return shipped_models()["recorded" if isinstance(segmenter, RecordedSegmenter) else "learned"]
 
@@ -116,7 +118,7 @@ class Skeletonizer:
         *,
         stage: Stage = lambda name: nullcontext(),
         memory_limit_bytes: int = 3 << 30,
-        models: Models | None = None,
+        models: Mapping[Depth, Models] | None = None,
     ) -> None:
         """Start without views.
 
@@ -184,6 +186,7 @@ class Skeletonizer:
             self._add(splines)
         self._known[view.index] = _Known(
             camera_in_base=view.base_from_camera[:3, 3],
+            matched=view.matched,
             splines=splines,
             shown=len(splines),
             instances=len(masks),
@@ -200,6 +203,7 @@ class Skeletonizer:
             self._canopy.add(view.index, seen)
         self._known[view.index] = _Known(
             camera_in_base=view.base_from_camera[:3, 3],
+            matched=view.matched,
             splines=seen.splines,
             shown=len(seen.splines) + seen.fragments,
             instances=len(masks),
@@ -331,7 +335,9 @@ class Skeletonizer:
         )
 
     def _canopy_skeleton(self) -> Extraction:
-        joined = skeleton_of(self._canopy, self._map, self._models)
+        matched = any(known.matched for known in self._known.values())
+        models = self._models["stereo" if matched else "camera"]
+        joined = skeleton_of(self._canopy, self._map, models)
         return Extraction(
             graph=joined.graph,
             voxels=self._map.occupied(),

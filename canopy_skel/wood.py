@@ -8,23 +8,27 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from canopy_skel.frame import Float32Array, View
-from canopy_skel.geometry import BoolArray
+from canopy_skel.geometry import BoolArray, IntArray
 from canopy_skel.pieces import Regions, depth_of
+from canopy_skel.woodpixels import PixelModel, layers_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FragmentConfig:
     """What counts as a fragment.
 
-    Pixels outside the masks with a wood probability of at least `min_probability`, connected, at
-    least `min_px`. They count within `margin_m` of the depths the masks span, so that rows behind
-    stay out. Colours are told apart in Lab bins after smoothing; `shrink_px` pixels of
+    Pixels outside the masks with a wood probability of at least `min_probability` (`min_detected`
+    where a detector gives it), connected, at least `min_px`. Pixels whose colour has log odds under
+    `min_log_odds` are not asked. They count within `margin_m` of the depths the masks span, so that
+    rows behind stay out. Colours are told apart in Lab bins after smoothing; `shrink_px` pixels of
     nothing-known are added to each, so that a colour seldom seen says little.
     """
 
-    min_probability: float = 0.6
+    min_probability: float = 0.3
+    min_detected: float = 0.6
+    min_log_odds: float = -1.0
     blur_px: int = 3
-    min_px: int = 14
+    min_px: int = 10
     max_px: int = 4000
     margin_m: float = 0.3
     shrink_px: float = 2.0
@@ -51,18 +55,43 @@ def mask_image(view: View, regions: Regions) -> BoolArray:
     return covered
 
 
-def colour_wood_probability(view: View, covered: BoolArray, config: FragmentConfig) -> Float32Array:
-    """Return (H, W) wood probabilities by colour, learned from the view's own masks.
+def wood_probability(
+    view: View, covered: BoolArray, config: FragmentConfig, model: PixelModel
+) -> Float32Array:
+    """Return (H, W) wood probabilities of pixels outside the masks, 0 where nothing is asked.
 
-    Wood is what the masks cover, the rest is taken for not wood; only pixels at the depths of the
-    tree are asked, the others are 0. One view alone, so that no other view changes its fragments.
+    Colour, learned from the view's own masks, says which pixels to ask; the model looks at what
+    lies around them. One view alone, so that no other view changes its fragments.
+    """
+    probability = np.zeros(covered.shape, dtype=np.float32)
+    log_odds, mean_odds = colour_log_odds(view, covered, config)
+    v, u = asked_pixels(mean_odds, config)
+    if len(v) == 0:
+        return probability
+    layers = layers_of(view, covered, log_odds)
+    probability[v, u] = model.probability(layers, mean_odds[v, u], v, u)
+    return probability
+
+
+def asked_pixels(mean_odds: Float32Array, config: FragmentConfig) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the pixels whose colour may be that of wood."""
+    v, u = np.nonzero(mean_odds >= config.min_log_odds)
+    return v.astype(np.int64), u.astype(np.int64)
+
+
+def colour_log_odds(
+    view: View, covered: BoolArray, config: FragmentConfig
+) -> tuple[Float32Array, Float32Array]:
+    """Return log odds of wood by colour (H, W), and their means among pixels that are asked.
+
+    Wood is what the masks cover, the rest is taken for not wood; only pixels beside the masks at
+    the depths of the tree are asked, the means of others are negative infinite.
     """
     near = at_tree(view, covered, config)
-    probability = np.zeros(covered.shape, dtype=np.float32)
-    wood = near & covered
-    other = near & ~covered
+    mean = np.full(covered.shape, -np.inf, dtype=np.float32)
+    wood, other = near & covered, near & ~covered
     if not wood.any() or not other.any():
-        return probability
+        return np.zeros(covered.shape, dtype=np.float32), mean
     lab = cv2.cvtColor(view.color_rgb, cv2.COLOR_RGB2Lab)
     bins = (
         (lab[..., 0].astype(np.int32) >> 3 << 12)
@@ -73,13 +102,12 @@ def colour_wood_probability(view: View, covered: BoolArray, config: FragmentConf
     known = config.shrink_px * (of_wood + of_other) / (of_wood.sum() + of_other.sum()) + 1e-9
     share_wood = (of_wood + known) / (of_wood.sum() + known.sum())
     share_other = (of_other + known) / (of_other.sum() + known.sum())
-    log_odds = np.log(share_wood / share_other).astype(np.float32).ravel()
+    log_odds = np.log(share_wood / share_other).astype(np.float32).ravel()[bins]
     # A pixel's neighbours are mostly what it is; noise is not.
     size = (config.blur_px, config.blur_px)
     asked = cv2.blur(other.astype(np.float32), size)
-    mean = cv2.blur(np.where(other, log_odds[bins], np.float32(0)), size)[other] / asked[other]
-    probability[other] = 1.0 / (1.0 + np.exp(-mean))
-    return probability
+    mean[other] = cv2.blur(np.where(other, log_odds, np.float32(0)), size)[other] / asked[other]
+    return log_odds, mean
 
 
 def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray:
@@ -93,9 +121,11 @@ def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray
         return np.asarray((depth_m >= low - config.margin_m) & (depth_m <= high + config.margin_m))
 
 
-def fragments_of(probability: Float32Array, config: FragmentConfig) -> Regions:
+def fragments_of(
+    probability: Float32Array, min_probability: float, config: FragmentConfig
+) -> Regions:
     """Return the connected components of probable wood, in raster order."""
-    wood = (probability >= config.min_probability).astype(np.uint8)
+    wood = (probability >= min_probability).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(wood, connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
     kept = (area >= config.min_px) & (area <= config.max_px)

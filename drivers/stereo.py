@@ -73,7 +73,7 @@ def with_depth(view: View, config: StereoConfig = _DEFAULT) -> View:
     """Return the view with depth from its stereo pair; unchanged if it has depth, or no pair."""
     if view.depth_m is not None or view.stereo is None:
         return view
-    return replace(view, depth_m=depth_from_stereo(view.stereo, config))
+    return replace(view, depth_m=depth_from_stereo(view.stereo, config), matched=True)
 
 
 def _disparity(pair: StereoPair, config: StereoConfig) -> Float32Array:

@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from scipy.spatial import cKDTree
+
 from canopy_skel.canopy import CanopyConfig, CanopyScan
-from canopy_skel.confidence import Masks, Models
+from canopy_skel.confidence import Depth, Models, ModelSets
 from canopy_skel.document import from_json
 from canopy_skel.errors import RecordingError
 from canopy_skel.fitting import Lesson, fit_models, truth_points
@@ -13,55 +15,111 @@ from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
 from canopy_skel.wood import wood_of
+from canopy_skel.woodpixels import PixelModel
 from drivers.stereo import with_depth
 from service.experiment.segmenters import segmenter_named
+from service.pixellessons import pixel_model_of
 
 
-def lesson_from(path: Path, segmenter: str, *, use_fragments: bool = True) -> Lesson:
-    """Read a recording and take all its views in.
+def pixel_models_without(paths: Sequence[Path]) -> dict[Path, PixelModel | None]:
+    """Return for each recording a model of wood pixels that was fitted to other trees.
+
+    A model knows the trees it was fitted to better than others, and confidences learned there would
+    promise too much. Trees, by name without the foliage, are dealt out in two halves; where one is
+    empty there is nothing to fit to: None, the shipped model.
+
+    Raises:
+        RecordingError: one cannot be read, or has no truth.
+    """
+    trees = sorted({_tree(path) for path in paths})
+    halves = [[path for path in paths if trees.index(_tree(path)) % 2 == k] for k in (0, 1)]
+    if not all(halves):
+        return dict.fromkeys(paths)
+    models = [pixel_model_of(half, ("recorded",)) for half in halves]
+    return {path: models[1 - k] for k in (0, 1) for path in halves[k]}
+
+
+def _tree(path: Path) -> str:
+    """Return species and topology, which names of simulated scans begin with."""
+    return "_".join(path.stem.split("_")[:2])
+
+
+def lesson_from(
+    path: Path,
+    segmenter: str,
+    *,
+    use_fragments: bool = True,
+    pixel_model: PixelModel | None = None,
+) -> Lesson:
+    """Read a recording and take all its views in; wood pixels by the shipped model, or by this.
 
     Raises:
         RecordingError: it cannot be read, or has no truth.
         UsageError: there is no such segmenter.
     """
-    finder = segmenter_named(segmenter)
+    views, truth = _views_and_truth(path)
+    return _lesson(views, truth, segmenter, use_fragments, pixel_model)
+
+
+def lessons_from(
+    path: Path, masks: Sequence[str], pixel_model: PixelModel | None = None
+) -> list[Lesson]:
+    """Read a recording with each kind of masks, and with the first once more without fragments.
+
+    Raises: as `lesson_from`.
+    """
+    views, truth = _views_and_truth(path)
+    without = _lesson(views, truth, masks[0], False, None)
+    return [without, *(_lesson(views, truth, name, True, pixel_model) for name in masks)]
+
+
+def _views_and_truth(path: Path) -> tuple[list[View], cKDTree]:
     recording = read_recording(path)
     if recording.ground_truth is None:
         raise RecordingError(
             f"{path}: no true skeleton is attached; record it with canopy simulate"
         )
-    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments))
+    views = [with_depth(view) for view in recording.views() if isinstance(view, View)]
+    return views, truth_points(from_json(recording.ground_truth, str(path)))
+
+
+def _lesson(
+    views: Sequence[View],
+    truth: cKDTree,
+    segmenter: str,
+    use_fragments: bool,
+    pixel_model: PixelModel | None,
+) -> Lesson:
+    finder = segmenter_named(segmenter)
+    scan = CanopyScan(CanopyConfig(use_fragments=use_fragments), pixel_model)
     likelihood = LikelihoodMap(LikelihoodConfig())
-    for view in recording.views():
-        if isinstance(view, View):
-            usable = with_depth(view)
-            seen = scan.observe(usable, finder.segment(usable), wood_of(finder, usable))
-            likelihood.add(segments_of(seen.splines))
-            scan.add(view.index, seen)
-    truth = truth_points(from_json(recording.ground_truth, str(path)))
-    return Lesson(scan=scan, likelihood=likelihood, truth=truth)
-
-
-def lessons_from(path: Path, masks: Sequence[str]) -> list[Lesson]:
-    """Read a recording with each kind of masks, and with the first once more without fragments.
-
-    Raises: as `lesson_from`.
-    """
-    without = lesson_from(path, masks[0], use_fragments=False)
-    return [without, *(lesson_from(path, name) for name in masks)]
+    for view in views:
+        seen = scan.observe(view, finder.segment(view), wood_of(finder, view))
+        likelihood.add(segments_of(seen.splines))
+        scan.add(view.index, seen)
+    depth: Depth = "stereo" if any(view.matched for view in views) else "camera"
+    return Lesson(scan=scan, likelihood=likelihood, truth=truth, depth=depth)
 
 
 def fitted(
     lessons: Sequence[Sequence[Lesson]], names: Sequence[str], masks: Sequence[str]
-) -> dict[Masks, Models]:
-    """Fit to the `lessons_from` each scan; the first kind of masks are the recorded ones."""
+) -> ModelSets:
+    """Fit to the `lessons_from` each scan; the first kind of masks are the recorded ones.
+
+    Where no scan has one kind of depth, its models are fitted to the scans of the other.
+    """
     settings = MethodConfig(name="canopy").sha256()[:12]
 
-    def fit(kinds: Sequence[str]) -> Models:
+    def fit(kinds: Sequence[str], depth: Depth) -> Models:
+        chosen = [k for k, scan in enumerate(lessons) if scan[0].depth == depth]
+        chosen = chosen or list(range(len(lessons)))
         return fit_models(
-            [lesson for scan in lessons for lesson in scan[: len(kinds) + 1]],
-            f"fitted to {len(names)} scans (masks {', '.join(kinds)}; settings {settings}):"
-            f" {', '.join(names)}",
+            [lesson for k in chosen for lesson in lessons[k][: len(kinds) + 1]],
+            f"fitted to {len(chosen)} scans (masks {', '.join(kinds)}; settings {settings}):"
+            f" {', '.join(names[k] for k in chosen)}",
         )
 
-    return {"recorded": fit(masks[:1]), "learned": fit(masks)}
+    def both(kinds: Sequence[str]) -> dict[Depth, Models]:
+        return {"camera": fit(kinds, "camera"), "stereo": fit(kinds, "stereo")}
+
+    return {"recorded": both(masks[:1]), "learned": both(masks)}

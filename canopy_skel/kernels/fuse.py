@@ -113,6 +113,51 @@ def shift_across(
     return moved, turned, support
 
 
+@kernel(
+    "float64[:,:,::1](int64[::1], float64[:,::1], float64[:,::1], float64[::1], int64[::1],"
+    " float64, float64, float64)"
+)
+def spread_around(
+    chosen: Ints,
+    directions: Floats,
+    references: Floats,
+    weights: Floats,
+    keys: Ints,
+    cell_m: float,
+    bandwidth_m: float,
+    own_share: float,
+) -> Floats:
+    """Return how the references (R, 3) lie around some of them: covariances (C, 3, 3).
+
+    References lie sorted by the `keys` of their cells of `cell_m` and count within twice the
+    bandwidth, with Gaussian weights. `own_share` of the bandwidth squared is added along their own
+    `directions` (R, 3).
+    """
+    spread, found = np.zeros((len(chosen), 3, 3)), np.zeros(len(references), dtype=np.int64)
+    way, mean = np.zeros(3), np.zeros(3)
+    own = own_share * bandwidth_m**2
+    for c in range(len(chosen)):
+        i, total = chosen[c], 0.0
+        for a in range(3):
+            mean[a] = 0.0
+        for n in range(near(references, i, 2 * bandwidth_m, references, keys, cell_m, found)):
+            squared = 0.0
+            for a in range(3):
+                way[a] = references[found[n], a] - references[i, a]
+                squared += way[a] * way[a]
+            weight = weights[found[n]] * math.exp(-0.5 * squared / bandwidth_m**2)
+            total += weight
+            for a in range(3):
+                mean[a] += weight * way[a]
+                for b in range(3):
+                    spread[c, a, b] += weight * way[a] * way[b]
+        for a in range(3):
+            for b in range(3):
+                square = spread[c, a, b] - mean[a] * mean[b] / total
+                spread[c, a, b] = square / total + own * directions[i, a] * directions[i, b]
+    return spread
+
+
 @kernel("boolean[::1](int64[::1], int64[::1], int64[::1])")
 def thinned(order: Ints, start: Ints, neighbours: Ints) -> NDArray[np.bool_]:
     """Keep, in this order, each point none of whose neighbours is kept already."""

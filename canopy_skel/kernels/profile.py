@@ -315,3 +315,55 @@ def fit_regions(
             knots[i], quality[i],
         )  # fmt: skip
     return counts, knots, quality
+
+
+@kernel("void(float64[:,:,::1], int64[::1], float64[::1])")
+def shift_away(points: Floats, counts: Ints, shift_m: Floats) -> None:
+    """Move the knots (R, MAX_KNOTS, 3) of R lines, the first counts[i] of each, away from the eye.
+
+    By shift_m (R,), along the part of the ray across the line; not where that is next to nothing.
+    """
+    for i in range(len(counts)):
+        line = points[i, : counts[i]].copy()
+        for k in range(counts[i]):
+            along = line[min(k + 1, counts[i] - 1)] - line[max(k - 1, 0)]
+            along /= max(math.sqrt((along * along).sum()), 1e-12)
+            ray = line[k] / math.sqrt((line[k] * line[k]).sum())
+            across = ray - (ray * along).sum() * along
+            norm = math.sqrt((across * across).sum())
+            if norm > 0.05:
+                points[i, k] += shift_m[i] / norm * across
+
+
+@kernel("Tuple((float64[:,::1], float64[:,::1], int64[::1]))(float64[:,::1], int64[::1], float64)")
+def sample_lines(knots: Floats, start: Ints, step_m: float) -> tuple[Floats, Floats, Ints]:
+    """Return points at most `step_m` apart along lines, unit directions, the line of each.
+
+    Line i has the knots (N, 3) start[i] up to start[i + 1]; one of no length has no points.
+    """
+    length = np.zeros(len(knots))
+    total = 0
+    counts = np.zeros(len(start) - 1, dtype=np.int64)
+    for i in range(len(counts)):
+        way = 0.0
+        for k in range(start[i], start[i + 1] - 1):
+            step = knots[k + 1] - knots[k]
+            length[k] = math.sqrt((step * step).sum())
+            way += length[k]
+        if way >= 1e-6:
+            counts[i] = max(2, math.ceil(way / step_m) + 1)
+        total += counts[i]
+    points, directions = np.zeros((total, 3)), np.zeros((total, 3))
+    of, n = np.zeros(total, dtype=np.int64), 0
+    for i in range(len(counts)):
+        way = length[start[i] : start[i + 1] - 1].sum()
+        k, before = start[i], 0.0
+        for j in range(counts[i]):
+            at = way * j / (counts[i] - 1)
+            while k < start[i + 1] - 2 and at >= before + length[k]:
+                before += length[k]
+                k += 1
+            unit = (knots[k + 1] - knots[k]) / max(length[k], 1e-12)
+            points[n], directions[n], of[n] = knots[k] + (at - before) * unit, unit, i
+            n += 1
+    return points, directions, of

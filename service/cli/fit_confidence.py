@@ -32,29 +32,33 @@ def fit_confidence(
     """Refit the confidences of method canopy to scans whose truth is known.
 
     Those for recorded masks are fitted to recorded masks, with and without fragments; those for
-    learned masks to these and the ones of all other segmenters.
+    learned masks to these and the ones of all other segmenters. What tells wood pixels is fitted
+    for each half of the trees to the other half meanwhile; see fit-wood for the shipped one.
     """
     # Imported here: only this command fits.
     from canopy_skel.confidence import models_to
     from canopy_skel.fitting import reliability
-    from service.lessons import fitted, lesson_from, lessons_from
+    from service.lessons import fitted, lesson_from, lessons_from, pixel_models_without
 
     if output.is_dir():
         raise UsageError(f"{output} is a folder; name the JSON file to write")
     masks = ("recorded", *(segmenter or WORSE_MASKS))
+    pixel_models = pixel_models_without(recordings)
     lessons = []
     with progress_bars() as progress:
         task = progress.add_task("scans", total=len(recordings))
         for path in sorted(recordings):
-            lessons.append(lessons_from(path, masks))
+            lessons.append(lessons_from(path, masks, pixel_models[path]))
             progress.advance(task)
     models = fitted(lessons, [path.stem for path in sorted(recordings)], masks)
     output.write_bytes(models_to(models))
-    for kind, one in models.items():
-        stderr.print(f"{output}, {kind}: {one.provenance}", markup=False)
+    for kind, by_depth in models.items():
+        for depth, one in by_depth.items():
+            stderr.print(f"{output}, {kind}, {depth}: {one.provenance}", markup=False)
     for path in held_out or []:
         for name in masks:
-            chosen = models["recorded" if name == "recorded" else "learned"]
-            row = reliability(lesson_from(path, name), chosen)
+            lesson = lesson_from(path, name)
+            chosen = models["recorded" if name == "recorded" else "learned"][lesson.depth]
+            row = reliability(lesson, chosen)
             figures = " ".join(f"{model} {value:.3f}" for model, value in row.items())
             typer.echo(f"{path.stem}, {name}: {figures}")

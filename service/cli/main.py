@@ -11,6 +11,7 @@ from service.cli.experiment import experiment
 from service.cli.export import export
 from service.cli.export_onnx import export_onnx
 from service.cli.fit_confidence import fit_confidence
+from service.cli.fit_wood import fit_wood
 from service.cli.inspect import inspect
 from service.cli.recover import recover
 from service.cli.replay import replay
@@ -44,6 +45,7 @@ for verb in (
     export_onnx,
     doctor,
     fit_confidence,
+    fit_wood,
 ):
     app.command()(verb)
 app.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})(worker)

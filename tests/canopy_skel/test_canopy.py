@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scenes.leaves import GAP, leafy_view
 from scenes.wood import WOOD, view_from
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.canopy import CanopyConfig, CanopyScan, canopy_config_from, piece_means
 from canopy_skel.confidence import (
@@ -19,16 +21,24 @@ from canopy_skel.confidence import (
     shipped_models,
 )
 from canopy_skel.document import Method, build_document, from_json, to_json
-from canopy_skel.ends import find_ends
+from canopy_skel.ends import Ends, find_ends
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
+from canopy_skel.fusion import FusionConfig, Observations, turned
 from canopy_skel.geometry import transform_points
-from canopy_skel.links import Candidates, accepted
+from canopy_skel.links import Candidates, LinkConfig, Parts, forest_of, links_to_make, places_on
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
 from canopy_skel.segmenters.recorded import RecordedSegmenter
-from canopy_skel.wood import FragmentConfig, WoodDetector, colour_wood_probability, fragments_of
+from canopy_skel.slivers import inside_thicker
+from canopy_skel.wood import FragmentConfig, WoodDetector, fragments_of, wood_probability
+from canopy_skel.woodpixels import (
+    fit_pixels,
+    pixel_model_from,
+    pixel_model_to,
+    shipped_pixel_model,
+)
 
 PLAIN = view_from(0)
 
@@ -265,7 +275,7 @@ def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
     assert counts[2, HIDDEN] == 2
 
 
-def test_colour_tells_unmasked_wood_from_leaves():
+def test_unmasked_wood_is_told_from_leaves():
     view = PLAIN
     color = np.zeros((240, 320, 3), np.uint8)
     noise = np.random.default_rng(0).integers(-8, 9, color.shape)
@@ -275,13 +285,45 @@ def test_colour_tells_unmasked_wood_from_leaves():
     depth_m = np.where(np.isnan(view.depth_m), np.float32(1.05), view.depth_m)
     masked = wood & (view.instances != 3)
     coloured = replace(PLAIN, color_rgb=color, depth_m=depth_m)
-    probability = colour_wood_probability(coloured, masked, FragmentConfig())
-    found = fragments_of(probability, FragmentConfig())
+    config = FragmentConfig()
+    probability = wood_probability(coloured, masked, config, shipped_pixel_model())
+    found = fragments_of(probability, config.min_probability, config)
     shown = np.zeros(wood.shape, bool)
     shown[found.v, found.u] = True
-    assert shown[view.instances == 3].mean() > 0.8
+    assert shown[view.instances == 3].mean() > 0.6
     assert shown[~wood].mean() < 0.01
     assert not shown[masked].any()
+
+
+def test_fragments_turn_along_what_lies_around_them_and_instances_do_not():
+    random = np.random.default_rng(3)
+    way = np.array([2.0, 1.0, 2.0]) / 3
+    points = np.linspace(0, 0.2, 41)[:, None] * way + random.normal(0, 0.001, (41, 3))
+    directions = random.normal(size=(41, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = Observations(
+        points_in_base=points,
+        directions=directions,
+        radius_m=np.full(41, 0.004),
+        probability=np.full(41, 0.8),
+        view=np.zeros(41, np.int64),
+        fragment=np.arange(41) > 0,
+    )
+    found = turned(seen, FusionConfig()).directions
+    assert np.abs(found[1:] @ way).min() > 0.95
+    assert np.array_equal(found[0], directions[0])
+
+
+def test_the_pixel_model_learns_what_is_not_linear_and_is_written_as_it_is():
+    random = np.random.default_rng(5)
+    figures = random.normal(2.0, 3.0, (60000, 3)).astype(np.float32)
+    wood = (np.abs(figures[:, 0] - 2) > 3) & (figures[:, 1] > 0)
+    model = fit_pixels(figures, wood, np.ones(60000, np.float32), "noise")
+    hidden = np.maximum(figures @ model.first + model.first_bias, 0)
+    odds = hidden @ model.second + model.second_bias
+    assert ((odds > 0) == wood).mean() > 0.85
+    again = pixel_model_from(json.loads(pixel_model_to(model)))
+    assert np.allclose(again.first, model.first, rtol=1e-5)
 
 
 def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():
@@ -321,7 +363,7 @@ def test_every_forest_has_an_end_per_tip_and_two_per_lone_vertex(points, parents
     ),
     threshold=st.floats(0.1, 0.9),
 )
-def test_links_make_a_forest_use_each_end_once_and_take_the_best(links, threshold):
+def test_links_make_a_forest_that_joins_all_they_may_by_the_best(links, threshold):
     links = [link for link in links if link[0] != link[1]]
     end = np.array([a for a, *_ in links], dtype=np.int64)
     vertex = np.array([b for _, b, *_ in links], dtype=np.int64)
@@ -335,17 +377,98 @@ def test_links_make_a_forest_use_each_end_once_and_take_the_best(links, threshol
         features=np.zeros((len(links), 20)),
     )
     component = np.arange(10)
-    made = accepted(candidates, probability, component, component, threshold)
-    used = [*end[made].tolist(), *other[made][other[made] >= 0].tolist()]
-    assert len(used) == len(set(used))
-    assert (probability[made] >= threshold).all()
+    allowed = probability >= threshold
+    made = forest_of(candidates, probability, allowed, component, component)
+    assert allowed[made].all()
     root = list(range(10))
     for i in made.tolist():
         a, b = root[end[i]], root[vertex[i]]
         assert a != b
         root = [a if r == b else r for r in root]
-    if len(links) and probability.max() >= threshold:
-        assert probability[made].max() == probability.max()
+    # Any link left out closes a ring of links that are all at least as probable.
+    for i in np.flatnonzero(allowed).tolist():
+        better = made[probability[made] >= probability[i]]
+        _, part = connected_components(
+            coo_array((np.ones(len(better)), (end[better], vertex[better])), shape=(10, 10)),
+            directed=False,
+        )
+        assert part[end[i]] == part[vertex[i]]
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "radius_m", "direction", "fragment", "swallowed"),
+    [
+        (0.025, 0.015, (1.0, 0, 0), False, True),
+        (0.025, 0.015, (1.0, 0, 0), True, True),
+        (0.045, 0.015, (1.0, 0, 0), False, False),  # a twig before the trunk
+        (0.025, 0.015, (0, 1.0, 0), False, False),  # a branch that leaves it
+        (0.025, 0.035, (1.0, 0, 0), False, False),  # the trunk itself, measured otherwise
+    ],
+)
+def test_strips_that_leaves_cut_off_a_trunk_are_not_wood_of_their_own(
+    offset_m, radius_m, direction, fragment, swallowed
+):
+    along = np.linspace(-0.1, 0.1, 41)
+    trunk = np.column_stack([along, 0 * along, 0 * along])
+    seen = Observations(
+        points_in_base=np.vstack([trunk, [0, offset_m, 0]]),
+        directions=np.vstack([np.tile([1.0, 0, 0], (41, 1)), direction]),
+        radius_m=np.append(np.full(41, 0.04), radius_m),
+        probability=np.ones(42),
+        view=np.zeros(42, dtype=np.int64),
+        fragment=np.append(np.zeros(41, dtype=np.bool_), fragment),
+    )
+    found = inside_thicker(seen)
+    assert not found[:-1].any()
+    assert found[-1] == swallowed
+
+
+def one_link(*, fragment=False, empty=0.0):
+    """Return two parts 0.1 m apart and the straight link between their ends."""
+    features = np.zeros((1, 42))
+    features[0, [1, 6, 15, 16]] = 0.1, empty, 0.9, 0.8
+    along = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    parts = Parts(
+        points=np.array([[0.0, 0, 0], [0.1, 0, 0]]),
+        directions=along,
+        component=np.arange(2),
+        length_m=np.full(2, 0.1),
+        confidence=np.array([0.9, 0.8]),
+        radius_m=np.full(2, 0.005),
+        fragment=np.array([False, fragment]),
+        ends=Ends(vertex=np.arange(2), tangents=along, behind_m=np.full(2, 0.1)),
+    )
+    candidates = Candidates(
+        end=np.array([0]),
+        vertex=np.array([1]),
+        other=np.array([1]),
+        curves=np.linspace(parts.points[0], parts.points[1], 17)[None],
+        features=features,
+    )
+    return parts, candidates
+
+
+@pytest.mark.parametrize(
+    ("kind", "probability", "made"),
+    [({}, 0.3, 1), ({}, 0.2, 0), ({"fragment": True}, 0.3, 0), ({"empty": 0.4}, 0.9, 0)],
+)
+def test_a_link_must_be_probable_more_so_to_a_fragment_and_not_run_through_the_empty(
+    kind, probability, made
+):
+    config = LinkConfig(min_probability=0.25, min_fragment_probability=0.4, max_empty=0.3)
+    assert len(links_to_make(*one_link(**kind), np.array([probability]), config)) == made
+
+
+def test_places_on_a_link_lie_evenly_within_it_and_know_how_far_its_lips_are():
+    _, candidates = one_link()
+    places = places_on(candidates, np.array([0]), np.array([0.5]), 0.03)
+    np.testing.assert_allclose(places.points[:, 0], [0.025, 0.05, 0.075])
+    np.testing.assert_allclose(places.features[:, 0], 0.0, atol=1e-12)  # even odds
+    np.testing.assert_allclose(places.features[:, 1:3], [[0.9, 0.8]] * 3)
+    np.testing.assert_allclose(
+        places.features[:, 3:], [[0.025, 0.075], [0.05, 0.05], [0.025, 0.075]]
+    )
+    assert places.first.tolist() == [0, 3]
 
 
 def test_a_fitted_logistic_means_what_it_says():
@@ -366,7 +489,7 @@ def test_a_row_has_the_same_probability_alone_and_among_others():
 def test_models_survive_being_written():
     models = shipped_models()
     assert models_from(json.loads(models_to(models))) == models
-    assert all(one.provenance for one in models.values())
+    assert all(one.provenance for by_depth in models.values() for one in by_depth.values())
 
 
 def test_masks_of_a_network_are_believed_less_than_recorded_ones(views):
@@ -382,6 +505,21 @@ def test_masks_of_a_network_are_believed_less_than_recorded_ones(views):
         trusting.add_view(view)
         wary.add_view(view)
     assert wary.skeleton().graph.confidence.mean() < trusting.skeleton().graph.confidence.mean()
+
+
+def test_matched_depth_has_models_of_its_own_whatever_the_order(views):
+    def confidence(views, models=None):
+        maker = Skeletonizer(RecordedSegmenter(), MethodConfig(name="canopy"), models=models)
+        for view in views:
+            maker.add_view(view)
+        return maker.skeleton().graph.confidence.tobytes()
+
+    shipped = models_for(RecordedSegmenter())
+    assert shipped["stereo"] != shipped["camera"]
+    matched = [replace(views[0], matched=True), *views[1:]]
+    as_stereo = confidence(views, {"camera": shipped["stereo"], "stereo": shipped["stereo"]})
+    assert confidence(matched) == confidence(matched[::-1]) == as_stereo
+    assert confidence(views) != as_stereo
 
 
 def test_a_false_mask_is_false_as_a_whole():

@@ -85,6 +85,7 @@ def test_a_view_gets_depth_only_if_it_has_none():
     assert with_depth(view) is view
     seen = with_depth(replace(view, stereo=pair))
     np.testing.assert_array_equal(seen.depth_m, depth_from_stereo(pair))
+    assert seen.matched
     assert with_depth(seen) is seen
 
 

@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter
+from canopy_skel.woodpixels import pixel_model_from, pixel_model_to
+from service.lessons import fitted, lessons_from, pixel_models_without
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,9 +56,59 @@ def test_fit_confidence_writes_models_that_know_where_they_come_from(canopy, tmp
     assert rows == ["leafy, recorded: instance_point", "leafy, false50: instance_point"]
     settings = MethodConfig(name="canopy").sha256()[:12]
     for kind, seen in (("recorded", "recorded"), ("learned", "recorded, false50")):
-        assert models_from(json.loads(models.read_bytes()))[kind].provenance == (
-            f"fitted to 1 scans (masks {seen}; settings {settings}): leafy"
-        )
+        for one in models_from(json.loads(models.read_bytes()))[kind].values():
+            assert one.provenance == (
+                f"fitted to 1 scans (masks {seen}; settings {settings}): leafy"
+            )
+
+
+def test_confidences_are_learned_beside_wood_pixels_of_other_trees(tmp_path):
+    truth = to_json(
+        build_document(sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0)
+    )
+    paths = [tmp_path / f"{name}.mcap" for name in ("apple_1_fd1", "apple_1_fd2", "oak_1_fd1")]
+    for path in paths:
+        write(path, [leafy_view(0), leafy_view(1, y=0.1)], truth)
+    beside = pixel_models_without(paths)
+    assert [beside[path].provenance.split("): ")[1] for path in paths] == [
+        "oak_1_fd1",
+        "oak_1_fd1",
+        "apple_1_fd1, apple_1_fd2",
+    ]
+    assert pixel_models_without(paths[:2]) == dict.fromkeys(paths[:2])
+
+
+def test_each_kind_of_depth_has_confidences_from_its_own_scans(tmp_path):
+    truth = to_json(
+        build_document(sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0)
+    )
+    path = tmp_path / "leafy.mcap"
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)], truth)
+    measured = lessons_from(path, ["recorded"])
+    assert {lesson.depth for lesson in measured} == {"camera"}
+    matched = [replace(lesson, depth="stereo") for lesson in measured]
+    models = fitted([measured, matched], ["one", "two"], ["recorded"])
+    for by_depth in models.values():
+        assert by_depth["camera"].provenance.endswith(": one")
+        assert by_depth["stereo"].provenance.endswith(": two")
+    alone = fitted([measured], ["one"], ["recorded"])["recorded"]
+    assert alone["stereo"] == alone["camera"]
+
+
+def test_fit_wood_writes_a_model_that_knows_where_it_comes_from(canopy, tmp_path):
+    path, output = tmp_path / "leafy.mcap", tmp_path / "wood.json"
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)])
+    code, _, stderr = canopy("fit-wood", path, "-o", output)
+    assert (code, "no true skeleton is attached" in stderr) == (1, True)
+    truth = build_document(
+        sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0
+    )
+    path.unlink()
+    write(path, [leafy_view(0), leafy_view(1, y=0.1)], to_json(truth))
+    assert canopy("fit-wood", path, "-o", output)[0] == 0
+    model = pixel_model_from(json.loads(output.read_bytes()))
+    assert model.provenance == "fitted to 1 scans (masks recorded, drop25+false20): leafy"
+    assert pixel_model_to(model) == output.read_bytes()
 
 
 def sticks():
