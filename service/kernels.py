@@ -1,8 +1,8 @@
 """The compiled kernels, made on all cores the first time.
 
 Numba compiles a module as it is imported, on one core, and keeps the result on disk. Here every
-module is first imported in one of as many processes, this one among them, so that a first start
-waits half as long on two cores. Run as `python -m service.kernels` after installing.
+module is imported in some process of its own first, so that a first start waits half as long on
+two cores. Run as `python -m service.kernels` after installing.
 
 Tried, to no gain: Numba's lower levels of optimisation (level 1 saves a tenth, of slower kernels),
 no vectorisers, no checks for division by zero, inner functions inlined before typing (all of them:
@@ -15,13 +15,9 @@ import multiprocessing
 import os
 import pkgutil
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from multiprocessing.sharedctypes import Synchronized
 
 PACKAGE = "canopy_skel.kernels"
 SELDOM = frozenset({"centreline", "strands", "volume"})
@@ -37,31 +33,10 @@ def compile_kernels(leaving_out: Collection[str] = SELDOM) -> None:
     if not os.access(folder.parent, os.W_OK) or any(folder.rglob("*.nbi")):
         return
     print("compiling the kernels, once", file=sys.stderr)  # noqa: T201 - before any other output
-    names = modules(leaving_out)
     spawn = multiprocessing.get_context("spawn")
-    begun = spawn.Value("i", 0)
-    others = [
-        spawn.Process(target=_compile, args=(names, begun))
-        for _ in range(min(os.cpu_count() or 1, 8) - 1)
-    ]
-    for other in others:
-        other.start()
-    _compile(names, begun)
-    for other in others:
-        other.join()
-
-
-def _compile(names: Sequence[str], begun: "Synchronized[int]") -> None:
-    """Import one module after the other that no other process has begun."""
-    gc.disable()  # What compiling makes lives on: looking for garbage takes a tenth of the time.
-    while True:
-        with begun.get_lock():
-            number = begun.value
-            begun.value += 1
-        if number >= len(names):
-            break
-        importlib.import_module(names[number])
-    gc.enable()
+    # What compiling makes lives as long as the process: looking for garbage takes a tenth of it.
+    with spawn.Pool(min(os.cpu_count() or 1, 8), initializer=gc.disable) as pool:
+        pool.map(_import, modules(leaving_out), chunksize=1)
 
 
 def modules(leaving_out: Collection[str] = ()) -> list[str]:
@@ -70,6 +45,10 @@ def modules(leaving_out: Collection[str] = ()) -> list[str]:
     found = [info.name for info in pkgutil.iter_modules([str(folder)])]
     found.sort(key=lambda name: -(folder / f"{name}.py").stat().st_size)
     return [f"{PACKAGE}.{name}" for name in found if name not in leaving_out]
+
+
+def _import(module: str) -> None:
+    importlib.import_module(module)
 
 
 def _kept_in() -> Path:
