@@ -84,7 +84,8 @@ INTRODUCTION = """# Method canopy beside method paper
 Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points set
 on other trees (the models' file names them; no walnut is among them). Columns are explained in
 [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it, without
-segmentation, on a busy machine. The number behind a recording is the share of its truth that no
+segmentation (medium foliage with fragments: on an idle machine; the rest on a
+busy one). The number behind a recording is the share of its truth that no
 mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated
 ones; fragments are told by colour and by what lies around each pixel, and simulated colours are not
 an orchard's: the rows "masks
