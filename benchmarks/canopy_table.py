@@ -81,17 +81,16 @@ LIMITS = (  # run, figure, at most
 BINS = 10
 INTRODUCTION = """# Method canopy beside method paper
 
-Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points set
-on other trees (the models' file names them; no walnut is among them). Columns are explained in
-[metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it, without
-segmentation (medium foliage with fragments: on an idle machine; the rest on a
-busy one). The number behind a recording is the share of its truth that no
-mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated
-ones; fragments are told by colour and by what lies around each pixel, and simulated colours are not
-an orchard's: the rows "masks
-only" do not depend on them. Rows with *worse masks* (a quarter dropped, a fifth false) and with the
-masks of the built-in *unet* show what a real detector would leave of it; they use the confidences
-for learned masks. Depth counts up to 3 m, so trees of the next row do not.
+Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points
+set on other trees (the models' file names them; no walnut is among them). Columns are explained
+in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it,
+without segmentation; other work on the machine adds to it. The number behind a recording is the
+share of its truth that no mask covers, which decides its class: up to .375 light, over .625
+heavy. Masks are the simulated ones; fragments are told by colour and by what lies around each
+pixel, and simulated colours are not an orchard's: the rows "masks only" do not depend on them.
+Rows with *worse masks* (a quarter dropped, a fifth false) and with the masks of the built-in
+*unet* show what a real detector would leave of it; they use the confidences for learned masks.
+Depth counts up to 3 m, so trees of the next row do not.
 
 ![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
 

@@ -1,0 +1,47 @@
+import json
+
+import numpy as np
+
+from canopy_skel.confidence import (
+    Logistic,
+    fit_logistic,
+    models_from,
+    models_to,
+    shipped_models,
+)
+from canopy_skel.woodpixels import fit_pixels, pixel_model_from, pixel_model_to
+
+
+def test_a_fitted_logistic_means_what_it_says():
+    rng = np.random.default_rng(3)
+    features = rng.normal(2.0, 3.0, (20000, 2))
+    true_p = 1 / (1 + np.exp(-(0.5 + features @ [0.4, -0.2])))
+    model = fit_logistic(features, rng.random(20000) < true_p)
+    assert np.abs(model(features) - true_p).max() < 0.03
+
+
+def test_a_row_has_the_same_probability_alone_and_among_others():
+    model = Logistic(bias=0.1, weights=(0.3, 0.7), means=(0.0, 1.0), scales=(1.0, 2.0))
+    features = np.random.default_rng(0).normal(size=(100, 2))
+    alone = [model(row[None])[0] for row in features]
+    assert model(features).tolist() == alone
+
+
+def test_models_survive_being_written():
+    models = shipped_models()
+    assert models_from(json.loads(models_to(models))) == models
+    assert all(one.provenance for by_depth in models.values() for one in by_depth.values())
+
+
+def test_the_pixel_model_learns_what_is_not_linear_and_is_written_as_it_is():
+    random = np.random.default_rng(5)
+    figures = random.normal(2.0, 3.0, (60000, 3)).astype(np.float32)
+    wood = (np.abs(figures[:, 0] - 2) > 3) & (figures[:, 1] > 0)
+    model = fit_pixels(figures, wood, np.ones(60000, np.float32), "noise")
+    hidden = np.maximum(figures @ model.first + model.first_bias, 0)
+    odds = hidden @ model.second + model.second_bias
+    linear = fit_logistic(figures, wood)(figures)
+    wrong, wrong_linear = ((odds > 0) != wood).mean(), ((linear > 0.5) != wood).mean()
+    assert wrong < 0.7 * wrong_linear
+    again = pixel_model_from(json.loads(pixel_model_to(model)))
+    assert np.allclose(again.first, model.first, rtol=1e-5)
