@@ -38,7 +38,8 @@ class Candidates:
     """Possible links: from end `end` to vertex `vertex`, at its end `other` or (-1) at its side.
 
     curves: (L, n, 3) points on each, both ends included; features: (L, F), figures and their
-    squares.
+    squares. gap_m: (L,) between what it joins; lips: (L, 2) the confidences of that; empty: (L,)
+    the share of it that runs where nothing can be.
     """
 
     end: IntArray
@@ -46,6 +47,9 @@ class Candidates:
     other: IntArray
     curves: FloatArray
     features: FloatArray
+    gap_m: FloatArray
+    lips: FloatArray
+    empty: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -79,10 +83,6 @@ class Parts:
 
 
 _SAMPLES = 17
-_EMPTY_SHARE = 6
-"""Its column among the features of a link."""
-_LIPS = slice(15, 17)
-"""The confidences of what it joins."""
 _PLACE_FEATURES = 5
 
 
@@ -107,8 +107,19 @@ def candidates_of(
         config.candidates,
     )
     curves = _curves(parts, end, vertex, other)
-    features = _features(parts, end, vertex, other, rank, curves, evidence, cost)
-    return Candidates(end=end, vertex=vertex, other=other, curves=curves, features=features)
+    counts = evidence(curves[:, 1:-1].reshape(-1, 3))
+    shares = _shares(counts, len(end))
+    start = parts.ends.vertex[end]
+    return Candidates(
+        end=end,
+        vertex=vertex,
+        other=other,
+        curves=curves,
+        features=_features(parts, end, vertex, other, rank, curves, shares, cost),
+        gap_m=np.linalg.norm(parts.points[vertex] - parts.points[start], axis=1),
+        lips=parts.confidence[np.column_stack([start, vertex])],
+        empty=is_empty(counts).reshape(len(end), _SAMPLES - 2).mean(axis=1),
+    )
 
 
 def _curves(parts: Parts, end: IntArray, vertex: IntArray, other: IntArray) -> FloatArray:
@@ -135,7 +146,7 @@ def _features(
     other: IntArray,
     rank: FloatArray,
     curves: FloatArray,
-    evidence: Evidence,
+    shares: FloatArray,
     cost: Cost,
 ) -> FloatArray:
     start = parts.ends.vertex[end]
@@ -146,10 +157,7 @@ def _features(
     cos_b = -np.sum(way * parts.ends.tangents[other], axis=1)
     side = np.abs(np.sum(way * parts.directions[vertex], axis=1))
     at_end = other >= 0
-    inner = curves[:, 1:-1].reshape(-1, 3)
-    counts = evidence(inner)
-    shares = _shares(counts, len(end))
-    nats = cost(inner).reshape(len(end), _SAMPLES - 2)
+    nats = cost(curves[:, 1:-1].reshape(-1, 3)).reshape(len(end), _SAMPLES - 2)
     radii = np.log(np.maximum(parts.radius_m, 1e-4))
     figures = np.column_stack(
         [
@@ -197,7 +205,7 @@ def links_to_make(
     fragment = parts.fragment[of_end[candidates.end]] | parts.fragment[candidates.vertex]
     limit = np.where(fragment, config.min_fragment_probability, config.min_probability)
     allowed = probability >= limit
-    allowed &= candidates.features[:, _EMPTY_SHARE] <= config.max_empty
+    allowed &= candidates.empty <= config.max_empty
     return forest_of(candidates, probability, allowed, parts.component, parts.component[of_end])
 
 
@@ -222,7 +230,7 @@ def forest_of(
             c = parent[c]
         return c
 
-    order = np.lexsort((candidates.features[:, 1], -probability))
+    order = np.lexsort((candidates.gap_m, -probability))
     chosen = []
     for i in order[allowed[order]].tolist():
         a = root(int(of_end[candidates.end[i]]))
@@ -247,7 +255,7 @@ def places_on(
         gone_m = length_m * np.arange(1, len(inner) + 1) / (len(inner) + 1)
         lips_m = np.sort(np.column_stack([gone_m, length_m - gone_m]), axis=1)
         p = min(max(float(probability[i]), 1e-3), 1.0 - 1e-3)
-        of_link = [np.log(p / (1.0 - p)), *candidates.features[i, _LIPS]]
+        of_link = [np.log(p / (1.0 - p)), *candidates.lips[i]]
         points.append(inner)
         features.append(np.column_stack([np.tile(of_link, (len(inner), 1)), lips_m]))
     return Places(

@@ -11,15 +11,11 @@ import cv2
 import numpy as np
 
 from canopy_skel.frame import Float32Array, View
-from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.geometry import BoolArray, IntArray
 from canopy_skel.kernels import around
 from canopy_skel.pieces import depth_of
 
 PIXEL_MODEL_FILE = "wood-pixels.json"
-_HIDDEN = 24
-_ROUNDS = 4
-_BATCH = 2048
-_FASTEST = 0.006
 _MOST_ODDS = 4.0
 _BLUR_PX = 0.7
 
@@ -73,55 +69,6 @@ def figures_of(
     return around.figures_around(layers, mean_odds, v, u)
 
 
-def fit_pixels(
-    figures: Float32Array, right: BoolArray, weights: Float32Array, provenance: str
-) -> PixelModel:
-    """Fit by Adam with a rate that rises and falls: figures (N, F), right and weights (N,)."""
-    means, scales = figures.mean(axis=0), figures.std(axis=0) + np.float32(1e-6)
-    x, y = (figures - means) / scales, right.astype(np.float32)
-    random = np.random.default_rng(0)
-    shape = (x.shape[1], _HIDDEN)
-    values: list[Any] = [
-        random.normal(0.0, shape[0] ** -0.5, shape).astype(np.float32),
-        np.zeros(_HIDDEN, np.float32),
-        random.normal(0.0, _HIDDEN**-0.5, _HIDDEN).astype(np.float32),
-        np.zeros((), np.float32),
-    ]
-    first, second = [0.0 * v for v in values], [0.0 * v for v in values]
-    batches = [
-        batch
-        for _ in range(_ROUNDS)
-        for batch in np.array_split(random.permutation(len(x)), max(1, len(x) // _BATCH))
-    ]
-    for step, batch in enumerate(batches, start=1):
-        rate = _FASTEST * np.sin(np.pi * step / len(batches))
-        slopes = _slopes(values, x[batch], y[batch], weights[batch])
-        for i, slope in enumerate(slopes):
-            first[i] = 0.9 * first[i] + 0.1 * slope
-            second[i] = 0.999 * second[i] + 0.001 * slope**2
-            mean, square = first[i] / (1 - 0.9**step), second[i] / (1 - 0.999**step)
-            values[i] = values[i] - np.float32(rate) * mean / (np.sqrt(square) + 1e-8)
-    raw = values[0] / scales[:, None]
-    return PixelModel(
-        first=raw.astype(np.float32),
-        first_bias=(values[1] - means @ raw).astype(np.float32),
-        second=values[2].astype(np.float32),
-        second_bias=float(values[3]),
-        provenance=provenance,
-    )
-
-
-def _slopes(
-    values: list[Any], x: Float32Array, y: Float32Array, weights: Float32Array
-) -> list[Any]:
-    """Return the slopes of the weighted mean log loss in each of the values."""
-    hidden = np.maximum(x @ values[0] + values[1], 0)
-    odds = np.clip(hidden @ values[2] + values[3], -30, 30)
-    error = weights * (1 / (1 + np.exp(-odds)) - y) / weights.sum()
-    back = np.outer(error, values[2]) * (hidden > 0)
-    return [x.T @ back, back.sum(axis=0), error @ hidden, error.sum()]
-
-
 def pixel_model_from(value: Mapping[str, Any]) -> PixelModel:
     """Return the model that `pixel_model_to` wrote."""
     first, first_bias, second = (
@@ -139,7 +86,7 @@ def pixel_model_from(value: Mapping[str, Any]) -> PixelModel:
 def pixel_model_to(model: PixelModel) -> bytes:
     """Return the model as JSON, six digits of each weight."""
 
-    def rounded(values: Float32Array | FloatArray) -> list[float]:
+    def rounded(values: Float32Array) -> list[float]:
         return [float(f"{value:.6g}") for value in values.tolist()]
 
     rows = ",\n  ".join(json.dumps(rounded(row)) for row in model.first)

@@ -16,13 +16,14 @@ from canopy_skel.pieces import depth_of, regions_of_masks
 from canopy_skel.recording import read_recording
 from canopy_skel.segment import Segmenter
 from canopy_skel.wood import asked_pixels, colour_log_odds, mask_image
-from canopy_skel.woodpixels import PixelModel, figures_of, fit_pixels, layers_of
+from canopy_skel.woodpixels import PixelModel, figures_of, layers_of
 from service.experiment.segmenters import segmenter_named
+from service.pixelfit import fit_pixels
 
 _WITHIN_M = 0.012
 _BESIDE_M = 0.006
-_KEPT_SHARE = 0.2
-"""Of the pixels that are not wood, which are many, this share is learned from."""
+_WOOD_SHARE, _OTHER_SHARE = 0.5, 0.1
+"""What is learned from of the pixels that are wood, and of those that are not, which are many."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -91,10 +92,11 @@ def _pixels(view: View, finder: Segmenter, tree: cKDTree, radius_m: FloatArray) 
     )
     distance_m, nearest = tree.query(transform_points(view.base_from_camera, surface))
     wood = distance_m <= np.maximum(_WITHIN_M, radius_m[nearest] + _BESIDE_M)
-    drawn = wood | (np.random.default_rng(view.index).random(len(v)) < _KEPT_SHARE)
-    v, u, wood = v[drawn], u[drawn], wood[drawn]
+    shares = np.where(wood, _WOOD_SHARE, _OTHER_SHARE)
+    drawn = np.random.default_rng(view.index).random(len(v)) < shares
+    v, u, wood, shares = v[drawn], u[drawn], wood[drawn], shares[drawn]
     return Pixels(
         figures=figures_of(layers_of(view, covered, log_odds), mean_odds[v, u], v, u),
         wood=wood,
-        weights=np.where(wood, 1.0, 1.0 / _KEPT_SHARE).astype(np.float32),
+        weights=(1.0 / shares).astype(np.float32),
     )

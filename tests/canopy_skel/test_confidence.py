@@ -9,7 +9,6 @@ from canopy_skel.confidence import (
     models_to,
     shipped_models,
 )
-from canopy_skel.woodpixels import fit_pixels, pixel_model_from, pixel_model_to
 
 
 def test_a_fitted_logistic_means_what_it_says():
@@ -31,17 +30,3 @@ def test_models_survive_being_written():
     models = shipped_models()
     assert models_from(json.loads(models_to(models))) == models
     assert all(one.provenance for by_depth in models.values() for one in by_depth.values())
-
-
-def test_the_pixel_model_learns_what_is_not_linear_and_is_written_as_it_is():
-    random = np.random.default_rng(5)
-    figures = random.normal(2.0, 3.0, (60000, 3)).astype(np.float32)
-    wood = (np.abs(figures[:, 0] - 2) > 3) & (figures[:, 1] > 0)
-    model = fit_pixels(figures, wood, np.ones(60000, np.float32), "noise")
-    hidden = np.maximum(figures @ model.first + model.first_bias, 0)
-    odds = hidden @ model.second + model.second_bias
-    linear = fit_logistic(figures, wood)(figures)
-    wrong, wrong_linear = ((odds > 0) != wood).mean(), ((linear > 0.5) != wood).mean()
-    assert wrong < 0.7 * wrong_linear
-    again = pixel_model_from(json.loads(pixel_model_to(model)))
-    assert np.allclose(again.first, model.first, rtol=1e-5)

@@ -47,6 +47,9 @@ def test_links_make_a_forest_that_joins_all_they_may_by_the_best(links, threshol
         other=other,
         curves=np.zeros((len(links), 17, 3)),
         features=np.zeros((len(links), 20)),
+        gap_m=np.zeros(len(links)),
+        lips=np.ones((len(links), 2)),
+        empty=np.zeros(len(links)),
     )
     component = np.arange(10)
     allowed = probability >= threshold
@@ -97,8 +100,6 @@ def test_strips_that_leaves_cut_off_a_trunk_are_not_wood_of_their_own(
 
 def one_link(*, fragment=False, empty=0.0):
     """Return two parts 0.1 m apart and the straight link between their ends."""
-    features = np.zeros((1, 42))
-    features[0, [1, 6, 15, 16]] = 0.1, empty, 0.9, 0.8
     along = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
     parts = Parts(
         points=np.array([[0.0, 0, 0], [0.1, 0, 0]]),
@@ -115,7 +116,10 @@ def one_link(*, fragment=False, empty=0.0):
         vertex=np.array([1]),
         other=np.array([1]),
         curves=np.linspace(parts.points[0], parts.points[1], 17)[None],
-        features=features,
+        features=np.zeros((1, 42)),
+        gap_m=np.array([0.1]),
+        lips=np.array([[0.9, 0.8]]),
+        empty=np.array([empty]),
     )
     return parts, candidates
 
