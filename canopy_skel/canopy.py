@@ -30,7 +30,7 @@ from canopy_skel.slivers import inside_thicker
 from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
-POINT_FEATURES = 46
+POINT_FEATURES = 23
 NO_MAP_NATS = 12.0
 """-log p where the likelihood map says nothing."""
 
@@ -201,11 +201,10 @@ def map_cost(likelihood: LikelihoodMap, points_in_base: FloatArray) -> FloatArra
 
 
 def point_features(seen: Observation, counts: IntArray, agreed: IntArray) -> FloatArray:
-    """Return what speaks for each point being wood (N, POINT_FEATURES): figures and their squares.
+    """Return what speaks for each point being wood (N, POINT_FEATURES).
 
     What all views say counts at the point and as the mean along its piece: a false mask is false
-    as a whole. The squares let a model prefer a middle, such as wood neither too thick nor too
-    thin.
+    as a whole.
     """
     empty = counts[:, THROUGH] + counts[:, BACKGROUND]
     total = np.maximum(empty + counts[:, WOOD] + counts[:, LEAF], 1)
@@ -217,7 +216,7 @@ def point_features(seen: Observation, counts: IntArray, agreed: IntArray) -> Flo
             agreed[:, 1:].sum(axis=1) / np.maximum(agreed[:, 0], 1),
         ]
     )
-    figures = np.column_stack(
+    return np.column_stack(
         [
             seen.quality,
             np.log1p(counts[:, WOOD]),
@@ -227,7 +226,6 @@ def point_features(seen: Observation, counts: IntArray, agreed: IntArray) -> Flo
             piece_means(said, seen.piece),
         ]
     )
-    return np.column_stack([figures, figures**2])
 
 
 def piece_means(values: FloatArray, piece: IntArray) -> FloatArray:

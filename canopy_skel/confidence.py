@@ -21,50 +21,84 @@ Depth = Literal["camera", "stereo"]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Logistic:
-    """p = 1 / (1 + exp(-(bias + weights · (x - means) / scales)))."""
+    """p = 1 / (1 + exp(-(bias + linear · z + products · (z_i z_j)))), z = (x - means) / scales.
+
+    Of F figures x there are F linear weights and F (F + 1) / 2 of products, of the pairs i <= j in
+    the order (0, 0), (0, 1), ... No figure counts for more than `FARTHEST` scales from its mean.
+    """
 
     bias: float
-    weights: tuple[float, ...]
+    linear: tuple[float, ...]
+    products: tuple[float, ...]
     means: tuple[float, ...]
     scales: tuple[float, ...]
 
-    def __call__(self, features: FloatArray) -> FloatArray:
-        """Return the probabilities (N,) of rows of features (N, F)."""
-        standard = (features[:, : len(self.weights)] - self.means) / self.scales
+    def __call__(self, figures: FloatArray) -> FloatArray:
+        """Return the probabilities (N,) of rows of figures (N, F)."""
+        columns = _standard(figures[:, : len(self.means)], self.means, self.scales).T
+        columns = np.ascontiguousarray(columns)
         # Added up one by one: a library product may differ in the last bit with the row count.
-        total = np.full(len(features), self.bias)
-        for column, weight in zip(standard.T, self.weights, strict=True):
-            total = total + weight * column
+        total = np.full(len(figures), self.bias)
+        weights = iter(self.products)
+        for i, column in enumerate(columns):
+            slope = np.full(len(figures), self.linear[i])
+            for other, weight in zip(columns[i:], weights, strict=False):
+                slope += weight * other
+            total += column * slope
         return np.asarray(1.0 / (1.0 + np.exp(-np.clip(total, -30.0, 30.0))))
 
 
-def fit_logistic(features: FloatArray, right: ArrayLike, ridge: float = 1.0) -> Logistic:
-    """Fit by Newton's method: features (N, F), right (N,) bool; `ridge` keeps weights finite.
+FARTHEST = 5.0
+_ROWS = 20000
+"""So many at once go into the sums of a fit."""
+
+
+def fit_logistic(figures: FloatArray, right: ArrayLike, ridge: float = 10.0) -> Logistic:
+    """Fit by Newton's method: figures (N, F), right (N,) bool; `ridge` keeps weights finite.
 
     Nothing to learn from gives even odds.
     """
     y = np.asarray(right, dtype=np.float64)
     if len(y) == 0:
-        return Logistic(bias=0.0, weights=(), means=(), scales=())
-    means, scales = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
-    design = np.column_stack([np.ones(len(y)), (features - means) / scales])
-    penalty = np.full(design.shape[1], ridge)
+        return Logistic(bias=0.0, linear=(), products=(), means=(), scales=())
+    means, scales = figures.mean(axis=0), np.maximum(figures.std(axis=0), 1e-6)
+    standard = _standard(figures, means, scales)
+    count = figures.shape[1]
+    penalty = np.full(1 + count + count * (count + 1) // 2, ridge)
     penalty[0] = 1e-3
-    beta = np.zeros(design.shape[1])
+    beta = np.zeros(len(penalty))
     for _ in range(40):
-        p = 1.0 / (1.0 + np.exp(-np.clip(design @ beta, -30.0, 30.0)))
-        gradient = design.T @ (y - p) - penalty * beta
-        hessian = (design * (p * (1.0 - p))[:, None]).T @ design + np.diag(penalty)
+        gradient, hessian = -penalty * beta, np.diag(penalty)
+        for first in range(0, len(y), _ROWS):
+            design = _terms(standard[first : first + _ROWS])
+            p = 1.0 / (1.0 + np.exp(-np.clip(design @ beta, -30.0, 30.0)))
+            gradient += design.T @ (y[first : first + _ROWS] - p)
+            hessian += (design * (p * (1.0 - p))[:, None]).T @ design
         step = np.linalg.solve(hessian, gradient)
         beta += np.clip(step, -2.0, 2.0)
-        if np.abs(step).max() < 1e-8:
+        if np.abs(step).max() < 1e-6:
             break
     return Logistic(
-        bias=round(float(beta[0]), 6),
-        weights=tuple(np.round(beta[1:], 6).tolist()),
-        means=tuple(np.round(means, 6).tolist()),
-        scales=tuple(np.round(scales, 6).tolist()),
+        bias=_rounded(beta[:1])[0],
+        linear=_rounded(beta[1 : 1 + count]),
+        products=_rounded(beta[1 + count :]),
+        means=_rounded(means),
+        scales=_rounded(scales),
     )
+
+
+def _standard(figures: FloatArray, means: ArrayLike, scales: ArrayLike) -> FloatArray:
+    return np.clip((figures - np.asarray(means)) / np.asarray(scales), -FARTHEST, FARTHEST)
+
+
+def _terms(standard: FloatArray) -> FloatArray:
+    """Return one, the figures and their products (N, 1 + F + F (F + 1) / 2)."""
+    i, j = np.triu_indices(standard.shape[1])
+    return np.column_stack([np.ones(len(standard)), standard, standard[:, i] * standard[:, j]])
+
+
+def _rounded(values: FloatArray) -> tuple[float, ...]:
+    return tuple(np.round(values, 6).tolist())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,7 +134,8 @@ def _one_from(value: Mapping[str, Any]) -> Models:
         **{
             name: Logistic(
                 bias=value[name]["bias"],
-                weights=tuple(value[name]["weights"]),
+                linear=tuple(value[name]["linear"]),
+                products=tuple(value[name]["products"]),
                 means=tuple(value[name]["means"]),
                 scales=tuple(value[name]["scales"]),
             )

@@ -102,7 +102,7 @@ class _Stage:
 
 Rows = tuple[FloatArray, BoolArray]
 """Features (N, F), and which rows are right (N,)."""
-_CERTAIN = Logistic(bias=5.0, weights=(), means=(), scales=())
+_CERTAIN = Logistic(bias=5.0, linear=(), products=(), means=(), scales=())
 
 
 def _stage(lesson: Lesson, fused: Observed, models: Models) -> _Stage:

@@ -25,7 +25,8 @@ class FusionConfig:
     around them, with Gaussian weights of `turn_m`; `own_direction` is the weight of their own, as a
     share of its square. Vertices are kept `spacing_m` apart, the best supported
     first, and joined up to `reach_m`. Dead ends up to `spur_m` at a fork are noise. Rows of
-    vertices that fragments show, whose own directions are poor, are smoothed in `smooth_steps`.
+    vertices that fragments show, whose own places are poor, are smoothed in `smooth_steps`, and
+    turned towards their directions, tips included, in `align_steps`.
     """
 
     steps: int = 3
@@ -40,6 +41,7 @@ class FusionConfig:
     reach_m: float = 0.017
     spur_m: float = 0.02
     smooth_steps: int = 8
+    align_steps: int = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -120,12 +122,13 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     points, directions, support = points[kept], directions[kept], support[kept]
     edges = forest(points, directions, config.reach_m)
     stay, edges = prune_spurs(points, edges, config.spur_m)
+    points, directions, support = points[stay], directions[stay], support[stay]
+    poor = support[:, 5] < 0.5
+    points = _smoothed(points, edges, poor, config.smooth_steps)
     return Observed(
-        vertices_in_base=_smoothed(
-            points[stay], edges, support[stay, 5] < 0.5, config.smooth_steps
-        ),
-        directions=directions[stay],
-        support=support[stay],
+        vertices_in_base=_aligned(points, directions, edges, poor, config.align_steps),
+        directions=directions,
+        support=support,
         edges=edges,
     )
 
@@ -181,6 +184,26 @@ def _smoothed(points: FloatArray, edges: IntArray, chosen: BoolArray, steps: int
     for _ in range(steps):
         middle = 0.5 * (adjacency @ points)
         points = np.where(free[:, None], 0.5 * (points + middle), points)
+    return points
+
+
+def _aligned(
+    points: FloatArray, directions: FloatArray, edges: IntArray, chosen: BoolArray, steps: int
+) -> FloatArray:
+    """Move the chosen points (V,) at no fork so that edges run as the directions of their ends."""
+    n = len(points)
+    a, b = edges.T
+    neighbours = np.bincount(edges.ravel(), minlength=n)
+    free = chosen & (neighbours > 0) & (neighbours < 3)
+    sign = np.where(np.sum(directions[a] * directions[b], axis=1) < 0, -1.0, 1.0)
+    along = directions[a] + sign[:, None] * directions[b]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    for _ in range(steps):
+        way = points[b] - points[a]
+        across = way - np.sum(way * along, axis=1, keepdims=True) * along
+        pulled = [np.bincount(a, c, n) - np.bincount(b, c, n) for c in across.T]
+        moved = points + 0.25 * np.stack(pulled, axis=1) / np.maximum(neighbours, 1)[:, None]
+        points = np.where(free[:, None], moved, points)
     return points
 
 

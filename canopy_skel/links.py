@@ -37,9 +37,9 @@ class LinkConfig:
 class Candidates:
     """Possible links: from end `end` to vertex `vertex`, at its end `other` or (-1) at its side.
 
-    curves: (L, n, 3) points on each, both ends included; features: (L, F), figures and their
-    squares. gap_m: (L,) between what it joins; lips: (L, 2) the confidences of that; empty: (L,)
-    the share of it that runs where nothing can be.
+    curves: (L, n, 3) points on each, both ends included; features: (L, F). gap_m: (L,) between
+    what it joins; lips: (L, 2) the confidences of that; empty: (L,) the share of it that runs where
+    nothing can be.
     """
 
     end: IntArray
@@ -159,7 +159,7 @@ def _features(
     at_end = other >= 0
     nats = cost(curves[:, 1:-1].reshape(-1, 3)).reshape(len(end), _SAMPLES - 2)
     radii = np.log(np.maximum(parts.radius_m, 1e-4))
-    figures = np.column_stack(
+    return np.column_stack(
         [
             np.log(length + 0.005),
             length,
@@ -180,7 +180,6 @@ def _features(
             np.abs(radii[start] - radii[vertex]),
         ]
     )
-    return np.column_stack([figures, figures**2])
 
 
 def _shares(counts: IntArray, links: int) -> FloatArray:

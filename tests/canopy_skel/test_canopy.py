@@ -15,7 +15,7 @@ from canopy_skel.confidence import (
 from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
-from canopy_skel.fusion import FusionConfig, Observations, turned
+from canopy_skel.fusion import FusionConfig, Observations, fuse, turned
 from canopy_skel.geometry import transform_points
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
@@ -298,6 +298,26 @@ def test_fragments_turn_along_what_lies_around_them_and_instances_do_not():
     found = turned(seen, FusionConfig()).directions
     assert np.abs(found[1:] @ way).min() > 0.95
     assert np.array_equal(found[0], directions[0])
+
+
+@pytest.mark.parametrize("fragments", [True, False])
+def test_what_fragments_show_runs_as_they_point_tips_included(fragments):
+    x = np.arange(0.0, 0.06, 0.0061)
+    off_m = 0.005 * (-1.0) ** np.arange(len(x))
+    seen = Observations(
+        points_in_base=np.column_stack([x, off_m, np.zeros(len(x))]),
+        directions=np.tile([1.0, 0.0, 0.0], (len(x), 1)),
+        radius_m=np.full(len(x), 0.002),
+        probability=np.full(len(x), 0.8),
+        view=np.zeros(len(x), np.int64),
+        fragment=np.full(len(x), fragments),
+    )
+    config = FusionConfig(steps=0, bandwidth_m=0.001, own_direction=1e6)
+    found = fuse(seen, config)
+    way = np.diff(found.vertices_in_base[found.edges], axis=1)[:, 0]
+    along = np.abs(way[:, 0]) / np.linalg.norm(way, axis=1)
+    assert len(way) == len(x) - 1
+    assert (along.min() > 0.9) == fragments
 
 
 def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():

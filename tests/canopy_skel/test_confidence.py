@@ -13,14 +13,21 @@ from canopy_skel.confidence import (
 
 def test_a_fitted_logistic_means_what_it_says():
     rng = np.random.default_rng(3)
-    features = rng.normal(2.0, 3.0, (20000, 2))
-    true_p = 1 / (1 + np.exp(-(0.5 + features @ [0.4, -0.2])))
-    model = fit_logistic(features, rng.random(20000) < true_p)
+    features = rng.normal(2.0, 3.0, (200000, 2))
+    together = 0.05 * (features[:, 0] - 2) * (features[:, 1] - 2)
+    true_p = 1 / (1 + np.exp(-(0.5 + features @ [0.4, -0.2] + together)))
+    model = fit_logistic(features, rng.random(200000) < true_p)
     assert np.abs(model(features) - true_p).max() < 0.03
 
 
 def test_a_row_has_the_same_probability_alone_and_among_others():
-    model = Logistic(bias=0.1, weights=(0.3, 0.7), means=(0.0, 1.0), scales=(1.0, 2.0))
+    model = Logistic(
+        bias=0.1,
+        linear=(0.3, 0.7),
+        products=(0.2, -0.4, 0.1),
+        means=(0.0, 1.0),
+        scales=(1.0, 2.0),
+    )
     features = np.random.default_rng(0).normal(size=(100, 2))
     alone = [model(row[None])[0] for row in features]
     assert model(features).tolist() == alone
