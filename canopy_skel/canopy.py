@@ -19,7 +19,7 @@ from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.kernels.agree import AGREEMENT
+from canopy_skel.kernels import agree
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
 from canopy_skel.observe import Observation, observe
@@ -106,7 +106,7 @@ class CanopyScan:
 
     def add(self, index: int, seen: Observation) -> None:
         """Take a view in: all points are asked in it, and its points in all views."""
-        agreed = np.zeros((len(seen.points_in_base), AGREEMENT), dtype=np.int64)
+        agreed = np.zeros((len(seen.points_in_base), agree.AGREEMENT), dtype=np.int64)
         for other, points in self._seen.items():
             self._counts[other] += counted(seen.evidence.classify(points.points_in_base))
             self._agreed[other] += seen.agreement(points.points_in_base, points.directions)

@@ -88,7 +88,7 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     The points must come in canonical order; nothing else decides ties.
     """
     if len(seen.points_in_base) == 0:
-        return _NOTHING
+        return _nothing()
     seen = turned(seen, config)
     cell_m = 2 * config.bandwidth_m
     keys = kernel.cell_keys(seen.points_in_base, cell_m)
@@ -204,9 +204,10 @@ def _thinned(points: FloatArray, density: FloatArray, spacing_m: float) -> IntAr
     return np.flatnonzero(kernel.thinned(order, start, np.ascontiguousarray(both[:, 1])))
 
 
-_NOTHING = Observed(
-    vertices_in_base=np.zeros((0, 3)),
-    directions=np.zeros((0, 3)),
-    support=np.zeros((0, kernel.SUPPORT)),
-    edges=np.zeros((0, 2), dtype=np.int64),
-)
+def _nothing() -> Observed:
+    return Observed(
+        vertices_in_base=np.zeros((0, 3)),
+        directions=np.zeros((0, 3)),
+        support=np.zeros((0, kernel.SUPPORT)),
+        edges=np.zeros((0, 2), dtype=np.int64),
+    )
