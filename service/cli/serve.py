@@ -60,5 +60,4 @@ def worker(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> N
     # Imported here: only workers need the bus.
     from service.worker import main as run_worker
 
-    compile_kernels((*METHODS, *SEGMENTERS))
     run_worker(arguments or [])
