@@ -25,16 +25,16 @@ PACKAGE = "canopy_skel.kernels"
 
 
 def compile_kernels(needed_by: Iterable[str]) -> None:
-    """Have on disk what methods and segmenters of these names need; nothing if it may not be kept.
-
-    A module counts as compiled if any kernel of it is there. What is missing or out of date then is
-    compiled when it is used, on one core.
-    """
+    """Have on disk what methods and segmenters of these names need; those not listed need none."""
     compile_modules(frozenset().union(*(NEEDED_BY.get(name, ()) for name in needed_by)))
 
 
 def compile_modules(names: Iterable[str]) -> None:
-    """Import those of these modules that have no kernel on disk, each in some other process."""
+    """Have kernels of these modules on disk; nothing to do where they are or may not be written.
+
+    A module counts as compiled if any kernel of it is there. What is missing or out of date then is
+    compiled when it is used, on one core.
+    """
     source, kept = Path(str(files(PACKAGE))), _kept_in()
     compiled = {path.name.split(".")[0] for path in kept.rglob("*.nbi")}
     missing = sorted(set(names) - compiled)
@@ -45,7 +45,7 @@ def compile_modules(names: Iterable[str]) -> None:
     print("compiling the kernels, once", file=sys.stderr)  # noqa: T201 - before any other output
     spawn = multiprocessing.get_context("spawn")
     # What compiling makes lives as long as the process: looking for garbage takes a tenth of it.
-    with spawn.Pool(min(os.cpu_count() or 1, len(missing)), initializer=gc.disable) as pool:
+    with spawn.Pool(min(os.cpu_count() or 1, len(missing), 8), initializer=gc.disable) as pool:
         pool.map(_import, missing, chunksize=1)
 
 
