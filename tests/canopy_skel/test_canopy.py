@@ -13,10 +13,11 @@ from canopy_skel.confidence import (
     shipped_models,
 )
 from canopy_skel.document import Method, build_document, from_json, to_json
-from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
-from canopy_skel.evidence import WOOD as WOOD_SEEN
+from canopy_skel.evidence import count_evidence, evidence_of, is_empty
 from canopy_skel.fusion import FusionConfig, Observations, turned
 from canopy_skel.geometry import transform_points
+from canopy_skel.kernels.verdicts import HIDDEN
+from canopy_skel.kernels.verdicts import WOOD as WOOD_SEEN
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
@@ -215,7 +216,7 @@ def test_wood_of_the_next_row_is_not_of_this_tree():
     there = transform_points(
         view.base_from_camera, back_projected(view, behind & np.isfinite(view.depth_m))
     )
-    assert not np.any(seen.evidence.classify(there) == WOOD_SEEN)
+    assert not count_evidence(there, [seen.evidence])[:, WOOD_SEEN].any()
     wider = observe(view, list(masks), PieceConfig(farthest_m=5.0), FragmentConfig())
     assert len(wider.splines) == 3
 
