@@ -153,9 +153,9 @@ class CanopyScan:
     def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
         """Return the fused forest of what was seen, and which views were moved for it."""
         points, directions, radius_m, fragment, view, features = self.points()
-        probability = np.where(
-            fragment, models.fragment_point(features), models.instance_point(features)
-        )
+        probability = np.empty(len(points))
+        probability[fragment] = models.fragment_point(features[fragment])
+        probability[~fragment] = models.instance_point(features[~fragment])
         limit = np.where(fragment, self.config.min_fragment_point, self.config.min_point)
         seen = Observations(
             points_in_base=points,
