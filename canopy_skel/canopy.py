@@ -14,13 +14,12 @@ from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.confidence import Models
 from canopy_skel.ends import find_ends
-from canopy_skel.evidence import count_evidence
+from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, count_evidence
 from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels.agree import AGREEMENT
-from canopy_skel.kernels.verdicts import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
 from canopy_skel.observe import Observation, observe

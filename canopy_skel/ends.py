@@ -64,7 +64,7 @@ def _path_from(
 def _tangents(
     paths: list[list[int]], behind: list[float], points: FloatArray, directions: FloatArray
 ) -> FloatArray:
-    """Return the outward direction (K, 3) of each path; a lone vertex comes twice, once each way."""
+    """Return the outward direction (K, 3) of each path; that of a lone vertex comes twice."""
     tangents = directions[np.array([path[0] for path in paths], dtype=np.int64)]
     long = [i for i, length_m in enumerate(behind) if length_m >= _SHORTEST_M]
     spread = np.zeros((len(long), 3, 3))

@@ -6,21 +6,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from canopy_skel.components import painted, runs_of
 from canopy_skel.frame import Float32Array, Intrinsics, UInt8Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, invert
-from canopy_skel.kernels.verdicts import (
-    BACKGROUND,
-    SHOWS_BACKGROUND,
-    SHOWS_DENSE,
-    SHOWS_WOOD,
-    THROUGH,
-    count_verdicts,
-)
+from canopy_skel.kernels import verdicts
 from canopy_skel.pieces import depth_of
 
+UNKNOWN, THROUGH, BACKGROUND, WOOD, LEAF, HIDDEN = range(6)
 STRIDE = 2
 _WINDOW = 5
-_MIN_VALID = 0.6
+_MIN_VALID_PX = 16
 _BACKGROUND_PX = 3000
 
 
@@ -41,7 +36,7 @@ class ViewEvidence:
     def count(self, points_in_base: FloatArray, counts: IntArray, times: int = 1) -> None:
         """Add what this view says of points (N, 3), `times` over, to `counts` (N, 6)."""
         camera = self.intrinsics
-        count_verdicts(
+        verdicts.count_verdicts(
             np.ascontiguousarray(points_in_base),
             self.camera_from_base,
             (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
@@ -56,22 +51,15 @@ class ViewEvidence:
 def evidence_of(view: View, wood: BoolArray) -> ViewEvidence:
     """Make a view ready to be asked; `wood` (H, W): a mask or a fragment covers the pixel."""
     depth_m = depth_of(view)
-    valid = np.isfinite(depth_m)
-    window = np.ones((_WINDOW, _WINDOW), dtype=np.uint8)
-    infinite = np.float32(np.inf)
-    # Outside the picture nothing may win: the default border of these filters never does.
-    nearest = cv2.erode(np.where(valid, depth_m, infinite), window)
-    farthest = cv2.dilate(np.where(valid, depth_m, -infinite), window)
-    share = cv2.blur(valid.astype(np.float32), (_WINDOW, _WINDOW))
-    around = cv2.dilate(wood.astype(np.uint8), np.ones((3, 3), dtype=np.uint8))
+    range_m, shows = verdicts.depth_ranges(depth_m, STRIDE, _WINDOW // 2, _MIN_VALID_PX)
+    around = np.asarray(cv2.dilate(wood.view(np.uint8), np.ones((3, 3), np.uint8)), dtype=np.uint8)
     every = (slice(None, None, STRIDE), slice(None, None, STRIDE))
-    shows = SHOWS_DENSE * (share[every] > _MIN_VALID).astype(np.uint8)
-    shows |= SHOWS_WOOD * (around[every] > 0).astype(np.uint8)
-    shows |= SHOWS_BACKGROUND * _background(~valid)[every].astype(np.uint8)
+    shows |= verdicts.SHOWS_WOOD * around[every]
+    shows |= verdicts.SHOWS_BACKGROUND * _background(~np.isfinite(depth_m))[every]
     return ViewEvidence(
         intrinsics=view.intrinsics,
         camera_from_base=invert(view.base_from_camera),
-        range_m=np.stack([nearest[every], farthest[every]], axis=2),
+        range_m=range_m,
         shows=shows,
     )
 
@@ -92,10 +80,8 @@ def is_empty(counts: IntArray) -> BoolArray:
     return np.asarray((counts[:, THROUGH] >= 1) | (counts[:, BACKGROUND] >= 2))
 
 
-def _background(missing: BoolArray) -> BoolArray:
-    """Return the large regions (H, W) without return, two pixels off their rims."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(missing.astype(np.uint8))
-    large = stats[:, cv2.CC_STAT_AREA] > _BACKGROUND_PX
-    large[0] = False
-    region = large[labels].astype(np.uint8)
-    return np.asarray(cv2.erode(region, np.ones((5, 5), np.uint8), borderValue=0) > 0)
+def _background(missing: BoolArray) -> UInt8Array:
+    """Return 1 in the large regions (H, W) without return, two pixels off their rims, else 0."""
+    runs = runs_of(missing)
+    region = painted(runs, runs.area > _BACKGROUND_PX, missing.shape).view(np.uint8)
+    return np.asarray(cv2.erode(region, np.ones((5, 5), np.uint8), borderValue=0), dtype=np.uint8)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from canopy_skel.evidence import is_empty
+from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, is_empty
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.kernels.verdicts import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD
 from canopy_skel.links import Cost, Evidence, Parts
 
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from canopy_skel.ends import Ends
-from canopy_skel.evidence import is_empty
+from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, is_empty
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels.candidates import link_candidates
-from canopy_skel.kernels.verdicts import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD
 
 Evidence = Callable[[FloatArray], IntArray]
 """Points (N, 3) -> counts of verdicts (N, 6)."""

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from canopy_skel.fusion import Observations, Observed
 from canopy_skel.geometry import FloatArray, IntArray, transform_from, transform_points
-from canopy_skel.kernels import aligning
-from canopy_skel.kernels.fuse import cell_keys
+from canopy_skel.kernels import aligning, fuse
 
 _MIN_COSINE = 0.9
 
@@ -84,7 +83,7 @@ class _Lines:
 
 
 def _lines(fused: Observed, cell_m: float) -> _Lines:
-    keys = cell_keys(fused.vertices_in_base, cell_m)
+    keys = fuse.cell_keys(fused.vertices_in_base, cell_m)
     order = np.argsort(keys, kind="stable")
     return _Lines(
         points=fused.vertices_in_base[order],

@@ -31,8 +31,9 @@ def inside_thicker(seen: Observations) -> BoolArray:
 def _within(seen: Observations, thin: IntArray, thick: IntArray, reach_m: float) -> IntArray:
     """Return which of the thin points (T,) lie within the wood of one of the nearest thick ones."""
     points = seen.points_in_base
-    distance_m, nearest = cKDTree(points[thick]).query(
-        points[thin], k=_NEAREST, distance_upper_bound=reach_m
+    distance_m, nearest = map(
+        np.asarray,
+        cKDTree(points[thick]).query(points[thin], k=_NEAREST, distance_upper_bound=reach_m),
     )
     some = np.isfinite(distance_m[:, 0])  # Few have any.
     thin, near = thin[some], np.isfinite(distance_m[some])
@@ -43,4 +44,4 @@ def _within(seen: Observations, thin: IntArray, thick: IntArray, reach_m: float)
     parallel = np.abs(np.sum(seen.directions[thin][:, None] * axis, axis=2)) >= _MIN_COSINE
     radius_m = seen.radius_m[other]
     inside = (across_m < _INSIDE * radius_m) & (np.abs(along_m) < radius_m)
-    return thin[(near & parallel & inside).any(axis=1)]
+    return np.asarray(thin[(near & parallel & inside).any(axis=1)])

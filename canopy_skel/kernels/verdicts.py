@@ -5,13 +5,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.compiled import kernel
+from canopy_skel.kernels.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Float32s = NDArray[np.float32]
 UNKNOWN, THROUGH, BACKGROUND, WOOD, LEAF, HIDDEN = range(6)
+"""As in `canopy_skel.evidence`, which must not compile this when it is imported."""
 SHOWS_DENSE, SHOWS_WOOD, SHOWS_BACKGROUND = 1, 2, 4
 _NEAREST_M = 0.05
+_FARTHEST_M = np.finfo(np.float32).max
 
 
 @kernel(
@@ -23,7 +26,7 @@ def count_verdicts(
     camera_from_base: Floats,
     camera: tuple[float, float, float, float],
     stride: int,
-    range_m: NDArray[np.float32],
+    range_m: Float32s,
     shows: NDArray[np.uint8],
     times: int,
     counts: Ints,
@@ -61,3 +64,55 @@ def count_verdicts(
         elif -math.inf < farthest < depth - margin:
             verdict = HIDDEN
         counts[i, verdict] += times
+
+
+@inner("int64(int64, int64)")
+def mirrored(at: int, length: int) -> int:
+    """Return the place in [0, length) that one beyond the rims mirrors, the rim not doubled."""
+    at = abs(at)
+    return max(min(at, 2 * (length - 1) - at), 0)
+
+
+@kernel(
+    "Tuple((float32[:,:,::1], uint8[:,::1]))(Array(float32, 2, 'C', readonly=True), int64, int64,"
+    " int64)"
+)
+def depth_ranges(
+    depth_m: Float32s, stride: int, reach: int, min_valid: int
+) -> tuple[Float32s, NDArray[np.uint8]]:
+    """Return least and largest depth (h, w, 2) within `reach` pixels of every pixel of `stride`.
+
+    Infinite (negative infinite) without any, but finite at the rims of the picture: what may lie
+    beyond hides places. Also returns SHOWS_DENSE (h, w) where at least `min_valid` pixels there
+    have depth; the picture is mirrored at its rims for that.
+    """
+    height, width = depth_m.shape
+    rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride
+    range_m = np.empty((rows, columns, 2), dtype=np.float32)
+    shows = np.zeros((rows, columns), dtype=np.uint8)
+    low, high = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    valid, none = np.empty(width, dtype=np.int32), np.float32(math.inf)
+    for row in range(rows):
+        top, bottom = row * stride - reach, row * stride + reach
+        nothing = none if top >= 0 and bottom < height else _FARTHEST_M
+        for u in range(width):
+            low[u], high[u], valid[u] = nothing, -nothing, 0
+        for at in range(top, bottom + 1):
+            v = mirrored(at, height)
+            for u in range(width):
+                z = depth_m[v, u]
+                has = abs(z) < none
+                low[u] = min(low[u], z if has else none)
+                high[u] = max(high[u], z if has else -none)
+                valid[u] += has
+        for column in range(columns):
+            left, right = column * stride - reach, column * stride + reach
+            least = none if left >= 0 and right < width else _FARTHEST_M
+            largest, count = -least, 0
+            for at in range(left, right + 1):
+                u = mirrored(at, width)
+                least, largest = min(least, low[u]), max(largest, high[u])
+                count += valid[u]
+            range_m[row, column, 0], range_m[row, column, 1] = least, largest
+            shows[row, column] = SHOWS_DENSE if count >= min_valid else 0
+    return range_m, shows

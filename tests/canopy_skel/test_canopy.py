@@ -13,11 +13,10 @@ from canopy_skel.confidence import (
     shipped_models,
 )
 from canopy_skel.document import Method, build_document, from_json, to_json
-from canopy_skel.evidence import count_evidence, evidence_of, is_empty
+from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
+from canopy_skel.evidence import WOOD as WOOD_SEEN
 from canopy_skel.fusion import FusionConfig, Observations, turned
 from canopy_skel.geometry import transform_points
-from canopy_skel.kernels.verdicts import HIDDEN
-from canopy_skel.kernels.verdicts import WOOD as WOOD_SEEN
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
