@@ -98,10 +98,11 @@ def colour_log_odds(
     wood, other = near & covered, near & ~covered
     if not wood.any() or not other.any():
         return np.zeros(covered.shape, dtype=np.float32), mean
-    bins = (lab[..., 0] >> 3).astype(np.int32)
-    for channel in (1, 2):
+    lightness, *colours = (np.asarray(one, dtype=np.uint8) for one in cv2.split(lab))
+    bins = (lightness >> 3).astype(np.int32)
+    for one in colours:
         bins <<= 6
-        bins |= lab[..., channel] >> 2
+        bins |= one >> 2
     of_wood, of_other = (_histogram(bins[chosen]) for chosen in (wood, other))
     known = config.shrink_px * (of_wood + of_other) / (of_wood.sum() + of_other.sum()) + 1e-9
     share_wood = (of_wood + known) / (of_wood.sum() + known.sum())
@@ -109,9 +110,8 @@ def colour_log_odds(
     log_odds = np.log(share_wood / share_other).astype(np.float32).ravel().take(bins)
     # A pixel's neighbours are mostly what it is; noise is not.
     size = (config.blur_px, config.blur_px)
-    asked = cv2.blur(other.astype(np.float32), size)
-    total = cv2.blur(np.where(other, log_odds, np.float32(0)), size)
-    np.divide(total, asked, out=mean, where=other)
+    beside = other.astype(np.float32)
+    np.divide(cv2.blur(log_odds * beside, size), cv2.blur(beside, size), out=mean, where=other)
     return log_odds, mean
 
 
