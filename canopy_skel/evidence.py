@@ -50,7 +50,7 @@ class ViewEvidence:
 
 def evidence_of(view: View, wood: BoolArray) -> ViewEvidence:
     """Make a view ready to be asked; `wood` (H, W): a mask or a fragment covers the pixel."""
-    depth_m = depth_of(view)
+    depth_m = np.ascontiguousarray(depth_of(view), dtype=np.float32)
     range_m, shows = verdicts.depth_ranges(depth_m, STRIDE, _WINDOW // 2, _MIN_VALID_PX)
     around = np.asarray(cv2.dilate(wood.view(np.uint8), np.ones((3, 3), np.uint8)), dtype=np.uint8)
     every = (slice(None, None, STRIDE), slice(None, None, STRIDE))

@@ -42,7 +42,7 @@ def no_box() -> Ints:
 @inner("int64(float64, float64)")
 def most_rows(reach_m: float, cell_m: float) -> int:
     """Return of how many rows along z the cells within reach of a place can be, at most."""
-    across = math.floor(2.0 * reach_m / cell_m) + 2
+    across = math.floor(2.0 * reach_m / cell_m) + 3
     return across * across
 
 
