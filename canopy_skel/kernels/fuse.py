@@ -57,28 +57,43 @@ def near(
 
 
 @inner(
-    "int64(float64, float64, float64, float64[:,::1], float64, int64, int64[::1], float64[::1],"
-    " float64[::1])"
+    "int64(float64[::1], float64[:,::1], float64, float64[::1], float64, int64, int64[::1],"
+    " float64[::1], float64[::1])"
 )
-def along(
-    dx: float,
-    dy: float,
-    dz: float,
+def weigh_along(
+    direction: Floats,
     directions: Floats,
     min_cosine: float,
+    weights: Floats,
+    width: float,
     count: int,
     found: Ints,
     squared: Floats,
     cosines: Floats,
 ) -> int:
-    """Keep of what was found that which runs along a direction, write its cosines; how many."""
-    kept = 0
+    """Keep of what was found that which runs along a direction, write its cosines; how many.
+
+    Their squared distances become their weights.
+    """
+    kept, dx, dy, dz = 0, direction[0], direction[1], direction[2]
     for n in range(count):
         j = found[n]
         cosine = dx * directions[j, 0] + dy * directions[j, 1] + dz * directions[j, 2]
         found[kept], squared[kept], cosines[kept] = j, squared[n], cosine
         kept += abs(cosine) >= min_cosine
+    # By themselves: a call among sums would put all of them aside.
+    for n in range(kept):
+        squared[n] = weights[found[n]] * math.exp(-0.5 * squared[n] / (width * width))
     return kept
+
+
+@inner("float64(float64[::1], float64, float64)")
+def widest(radii: Floats, bandwidth_m: float, radius_share: float) -> float:
+    """Return the largest bandwidth of any point."""
+    width = bandwidth_m
+    for i in range(len(radii)):
+        width = max(width, radius_share * radii[i])
+    return width
 
 
 @inner("int64(int64)")
@@ -123,21 +138,16 @@ def shift_across(
     moved, turned = points.copy(), directions.copy()
     support, found = np.zeros((len(points), SUPPORT)), np.zeros(len(references) + 1, dtype=np.int64)
     squared, cosines = np.zeros(len(found)), np.zeros(len(found))
-    widest = bandwidth_m
-    for i in range(len(points)):
-        widest = max(widest, radius_share * radii[i])
-    box, rows = no_box(), np.zeros((most_rows(2.0 * widest, cell_m), 2), dtype=np.int64)
+    reach_m = 2.0 * widest(radii, bandwidth_m, radius_share)
+    box, rows = no_box(), np.zeros((most_rows(reach_m, cell_m), 2), dtype=np.int64)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         width = max(bandwidth_m, radius_share * radii[i])
         count = near(px, py, pz, 2.0 * width, references, keys, cell_m, box, rows, found, squared)
-        count = along(
-            directions[i, 0], directions[i, 1], directions[i, 2], reference_directions, min_cosine,
-            count, found, squared, cosines,
+        count = weigh_along(
+            directions[i], reference_directions, min_cosine, weights, width, count, found, squared,
+            cosines,
         )  # fmt: skip
-        # Weights by themselves: a call among the sums would put all of them aside.
-        for n in range(count):
-            squared[n] = weights[found[n]] * math.exp(-0.5 * squared[n] / (width * width))
         total, bits = 0.0, 0
         ox = oy = oz = ex = ey = ez = r = mean_p = masks = largest = 0.0
         for n in range(count):
