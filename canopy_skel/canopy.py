@@ -14,12 +14,12 @@ from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.confidence import Models
 from canopy_skel.ends import find_ends
-from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, count_evidence, counted
+from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, count_evidence
 from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.kernels.agree import AGREEMENT
+from canopy_skel.kernels import agree
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
 from canopy_skel.observe import Observation, observe
@@ -106,15 +106,15 @@ class CanopyScan:
 
     def add(self, index: int, seen: Observation) -> None:
         """Take a view in: all points are asked in it, and its points in all views."""
-        agreed = np.zeros((len(seen.points_in_base), AGREEMENT), dtype=np.int64)
+        agreed = np.zeros((len(seen.points_in_base), agree.AGREEMENT), dtype=np.int64)
         for other, points in self._seen.items():
-            self._counts[other] += counted(seen.evidence.classify(points.points_in_base))
+            seen.evidence.count(points.points_in_base, self._counts[other])
             self._agreed[other] += seen.agreement(points.points_in_base, points.directions)
             agreed += points.agreement(seen.points_in_base, seen.directions)
         self._seen[index] = seen
         self._agreed[index] = agreed
         self._counts[index] = count_evidence(
-            seen.points_in_base, [one.evidence for one in self._seen.values()]
+            seen.points_in_base, (one.evidence for one in self._seen.values())
         )
 
     def remove(self, index: int) -> None:
@@ -124,12 +124,12 @@ class CanopyScan:
             return
         del self._counts[index], self._agreed[index]
         for other, points in self._seen.items():
-            self._counts[other] -= counted(gone.evidence.classify(points.points_in_base))
+            gone.evidence.count(points.points_in_base, self._counts[other], times=-1)
             self._agreed[other] -= gone.agreement(points.points_in_base, points.directions)
 
     def evidence(self, points_in_base: FloatArray) -> IntArray:
         """Return how many views say what (N, 6) of points (N, 3)."""
-        return count_evidence(points_in_base, [one.evidence for one in self._seen.values()])
+        return count_evidence(points_in_base, (one.evidence for one in self._seen.values()))
 
     def points(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, IntArray, FloatArray]:
         """Return all observed points: positions, directions, radii, fragment, view, features.
@@ -152,9 +152,9 @@ class CanopyScan:
     def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
         """Return the fused forest of what was seen, and which views were moved for it."""
         points, directions, radius_m, fragment, view, features = self.points()
-        probability = np.where(
-            fragment, models.fragment_point(features), models.instance_point(features)
-        )
+        probability = np.empty(len(points))
+        probability[fragment] = models.fragment_point(features[fragment])
+        probability[~fragment] = models.instance_point(features[~fragment])
         limit = np.where(fragment, self.config.min_fragment_point, self.config.min_point)
         seen = Observations(
             points_in_base=points,

@@ -10,7 +10,7 @@ from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, Intrinsics, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
 from canopy_skel.kernels import parts, trust
-from canopy_skel.kernels.strip import measure
+from canopy_skel.kernels import strip as outline
 from canopy_skel.segment import BranchMask
 
 FARTHEST_M = 3.0
@@ -144,7 +144,7 @@ def cluster_branches(
         reasons = [] if trusted.enough[i] else ["too few points with trusted depth"]
         strip = np.empty(5)
         if trusted.enough[i]:
-            measure(mask.mask, strip)
+            outline.measure(mask.mask, strip)
         for part in range(*np.searchsorted(slender.mask, (i, i + 1)).tolist()):
             first, end = slender.start[part : part + 2].tolist()
             if end - first < config.min_points:

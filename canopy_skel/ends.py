@@ -1,5 +1,6 @@
 """Free ends of a forest: where wood goes on that no view has shown."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,22 +31,19 @@ def find_ends(points: FloatArray, directions: FloatArray, edges: IntArray) -> En
     for a, b in edges.tolist():
         neighbours[a].append(b)
         neighbours[b].append(a)
-    vertex, tangents, behind = [], [], []
+    vertex: list[int] = []
+    paths: list[list[int]] = []
+    behind: list[float] = []
     for v, around in enumerate(neighbours):
-        if len(around) > 1:
-            continue
-        if not around:
-            vertex += [v, v]
-            tangents += [directions[v], -directions[v]]
-            behind += [0.0, 0.0]
-            continue
-        path, length_m = _path_from(v, neighbours, points)
-        vertex.append(v)
-        tangents.append(_tangent(points[path], directions[path], length_m))
-        behind.append(length_m)
+        if len(around) < 2:
+            path, length_m = _path_from(v, neighbours, points)
+            both = 1 if around else 2
+            vertex += [v] * both
+            paths += [path] * both
+            behind += [length_m] * both
     return Ends(
         vertex=np.array(vertex, dtype=np.int64),
-        tangents=np.array(tangents).reshape(-1, 3),
+        tangents=_tangents(paths, behind, points, directions),
         behind_m=np.array(behind),
     )
 
@@ -57,17 +55,29 @@ def _path_from(
     while len(onward) == 1 and length_m < TANGENT_M:
         came, here = path[-1], onward[0]
         path.append(here)
-        length_m += float(np.linalg.norm(points[here] - points[came]))
+        step = points[here] - points[came]
+        length_m += math.sqrt(step.dot(step))
         onward = [v for v in neighbours[here] if v != came]
     return path, length_m
 
 
-def _tangent(points: FloatArray, directions: FloatArray, length_m: float) -> FloatArray:
-    out = points[0] - points[-1]
-    if length_m < _SHORTEST_M:
-        mean = directions[0]
-    else:
-        centred = points - points.mean(axis=0)
-        mean = np.linalg.eigh(centred.T @ centred)[1][:, 2]
-    tangent = mean if mean @ out >= 0 else -mean
-    return np.asarray(tangent / max(float(np.linalg.norm(tangent)), 1e-12))
+def _tangents(
+    paths: list[list[int]], behind: list[float], points: FloatArray, directions: FloatArray
+) -> FloatArray:
+    """Return the outward direction (K, 3) of each path; that of a lone vertex comes twice."""
+    tangents = directions[np.array([path[0] for path in paths], dtype=np.int64)]
+    long = [i for i, length_m in enumerate(behind) if length_m >= _SHORTEST_M]
+    spread = np.zeros((len(long), 3, 3))
+    for place, i in enumerate(long):
+        along = points[paths[i]]
+        centred = along - np.add.reduce(along, axis=0) / len(along)
+        spread[place] = centred.T @ centred
+    tangents[long] = np.linalg.eigh(spread)[1][:, :, 2]
+    for i, path in enumerate(paths):
+        if len(path) == 1:
+            tangents[i] *= -1.0 if i and paths[i - 1] is path else 1.0
+            continue
+        mean = tangents[i]
+        tangent = mean if mean @ (points[path[0]] - points[path[-1]]) >= 0 else -mean
+        tangents[i] = tangent / max(math.sqrt(tangent @ tangent), 1e-12)
+    return tangents

@@ -90,34 +90,9 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     The points must come in canonical order; nothing else decides ties.
     """
     if len(seen.points_in_base) == 0:
-        return _NOTHING
+        return _nothing()
     seen = turned(seen, config)
-    cell_m = 2 * config.bandwidth_m
-    keys = kernel.cell_keys(seen.points_in_base, cell_m)
-    order = np.argsort(keys, kind="stable")
-    weight = seen.probability * np.where(seen.fragment, config.fragment_weight, 1.0)
-    seeds = _seeds(seen, weight, config.seed_m)
-    points, directions = seen.points_in_base[seeds], seen.directions[seeds]
-    radius_m, support = seen.radius_m[seeds], np.zeros((len(seeds), kernel.SUPPORT))
-    for _ in range(config.steps + 1):
-        points, directions, support = kernel.shift_across(
-            points,
-            directions,
-            radius_m,
-            seen.points_in_base[order],
-            seen.directions[order],
-            seen.radius_m[order],
-            weight[order],
-            seen.probability[order],
-            np.left_shift(1, seen.view[order] % _BITS),
-            seen.fragment[order],
-            keys[order],
-            cell_m,
-            config.bandwidth_m,
-            config.radius_share,
-            np.cos(np.radians(config.max_angle_deg)),
-        )
-        radius_m = support[:, 1].copy()
+    points, directions, support = _drawn(seen, config)
     kept = _thinned(points, support[:, 0], config.spacing_m)
     points, directions, support = points[kept], directions[kept], support[kept]
     edges = forest(points, directions, config.reach_m)
@@ -133,20 +108,59 @@ def fuse(seen: Observations, config: FusionConfig) -> Observed:
     )
 
 
+def _drawn(seen: Observations, config: FusionConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return seeds (S, 3) drawn onto the curves, their directions and support, in canonical order.
+
+    They are worked on cell by cell: neighbours share most of what is around them.
+    """
+    cell_m = 2 * config.bandwidth_m
+    keys = kernel.cell_keys(seen.points_in_base, cell_m)
+    order = np.argsort(keys, kind="stable")
+    weight = seen.probability * np.where(seen.fragment, config.fragment_weight, 1.0)
+    seeds = _seeds(seen, weight, config.seed_m)
+    by_cell = np.argsort(keys[seeds], kind="stable")
+    seeds = seeds[by_cell]
+    references = (
+        seen.points_in_base[order],
+        seen.directions[order],
+        seen.radius_m[order],
+        weight[order],
+        seen.probability[order],
+        np.left_shift(1, seen.view[order] % _BITS),
+        seen.fragment[order],
+        keys[order],
+    )
+    points, directions = seen.points_in_base[seeds], seen.directions[seeds]
+    radius_m, support = seen.radius_m[seeds], np.zeros((len(seeds), kernel.SUPPORT))
+    for _ in range(config.steps + 1):
+        points, directions, support = kernel.shift_across(
+            points,
+            directions,
+            radius_m,
+            *references,
+            cell_m,
+            config.bandwidth_m,
+            config.radius_share,
+            np.cos(np.radians(config.max_angle_deg)),
+        )
+        radius_m = support[:, 1].copy()
+    place = np.empty_like(by_cell)
+    place[by_cell] = np.arange(len(by_cell))
+    return points[place], directions[place], support[place]
+
+
 def turned(seen: Observations, config: FusionConfig) -> Observations:
     """Turn the points of fragments along what lies around them in all views.
 
     A fragment of 15 pixels does not show its own direction; many of them do.
     """
-    chosen = np.flatnonzero(seen.fragment)
-    if len(chosen) == 0:
+    if not seen.fragment.any():
         return seen
     keys = kernel.cell_keys(seen.points_in_base, config.turn_m)
     order = np.argsort(keys, kind="stable")
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
+    chosen = np.flatnonzero(seen.fragment[order])
     spread = kernel.spread_around(
-        place[chosen],
+        chosen,
         seen.directions[order],
         seen.points_in_base[order],
         seen.probability[order],
@@ -156,7 +170,7 @@ def turned(seen: Observations, config: FusionConfig) -> Observations:
         config.own_direction,
     )
     directions = seen.directions.copy()
-    directions[chosen] = np.linalg.eigh(spread)[1][:, :, 2]
+    directions[order[chosen]] = np.linalg.eigh(spread)[1][:, :, 2]
     return replace(seen, directions=directions)
 
 
@@ -217,19 +231,18 @@ def _seeds(seen: Observations, weight: FloatArray, seed_m: float) -> IntArray:
 
 
 def _thinned(points: FloatArray, density: FloatArray, spacing_m: float) -> IntArray:
-    if len(points) == 0:
-        return np.zeros(0, dtype=np.int64)
-    pairs = cKDTree(points).query_pairs(spacing_m, output_type="ndarray").astype(np.int64)
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    both = both[np.lexsort((both[:, 1], both[:, 0]))]
-    start = np.append(0, np.cumsum(np.bincount(both[:, 0], minlength=len(points))))
+    keys = kernel.cell_keys(points, spacing_m)
+    by_cell = np.argsort(keys, kind="stable")
+    points, density = points[by_cell], density[by_cell]
     order = np.lexsort((*points.T[::-1], -density))
-    return np.flatnonzero(kernel.thinned(order, start, np.ascontiguousarray(both[:, 1])))
+    kept = kernel.thinned(points, order, keys[by_cell], spacing_m, spacing_m)
+    return np.sort(by_cell[kept])
 
 
-_NOTHING = Observed(
-    vertices_in_base=np.zeros((0, 3)),
-    directions=np.zeros((0, 3)),
-    support=np.zeros((0, kernel.SUPPORT)),
-    edges=np.zeros((0, 2), dtype=np.int64),
-)
+def _nothing() -> Observed:
+    return Observed(
+        vertices_in_base=np.zeros((0, 3)),
+        directions=np.zeros((0, 3)),
+        support=np.zeros((0, kernel.SUPPORT)),
+        edges=np.zeros((0, 2), dtype=np.int64),
+    )

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canopy_skel.errors import UsageError
 from canopy_skel.geometry import FloatArray, IntArray
-from canopy_skel.kernels import ellipsoid, sums
-from canopy_skel.kernels.grid import RUN
+from canopy_skel.kernels import ellipsoid, grid, sums
 from canopy_skel.spline import BranchSpline
 from canopy_skel.voxels import Int32Array, VoxelBlocks, grown
 
@@ -28,13 +28,11 @@ LEVELS = 255
 """p_l is rounded to 1 / LEVELS where paths are searched."""
 
 
-def _level_table() -> NDArray[np.uint8]:
+@cache
+def level_table() -> NDArray[np.uint8]:
     """Return the level, 255 p_l rounded but at least 1, of sums >> LEVEL_SHIFT."""
     nat = (np.arange(6400) + 0.5) * (1 << sums.LEVEL_SHIFT) / sums.UNITS_PER_NAT
     return np.maximum(np.round(-LEVELS * np.expm1(-nat)), 1).astype(np.uint8)
-
-
-LEVEL_TABLE = _level_table()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -159,8 +157,9 @@ class LikelihoodMap:
         slots = self.blocks.slots_of(grid.voxels)
         total = self._sums[slots].astype(np.int64) + grid.units
         self._sums[slots] = np.minimum(total, sums.MAX_SUM)
-        places = np.minimum(self._sums[slots] >> sums.LEVEL_SHIFT, len(LEVEL_TABLE) - 1)
-        self.levels[slots] = LEVEL_TABLE[places]
+        table = level_table()
+        places = np.minimum(self._sums[slots] >> sums.LEVEL_SHIFT, len(table) - 1)
+        self.levels[slots] = table[places]
         self._changed.append(slots[self._marks[slots] == 0].astype(np.int32))
         self._marks[slots] = 1
 
@@ -206,11 +205,11 @@ class LikelihoodMap:
         self._grow()
         slopes, found = _slopes(rows, k), 0
         seen = np.empty(len(wide[1]) + len(thin[1]), dtype=np.int32)
-        totals = self._sums.reshape(-1, RUN)
-        levels, marks = (a.reshape(-1, RUN) for a in (self.levels, self._marks))
+        totals = self._sums.reshape(-1, grid.RUN)
+        levels, marks = (a.reshape(-1, grid.RUN) for a in (self.levels, self._marks))
         for runs in (wide, thin):
             found = sums.accumulate(*runs, slopes, sign, totals, marks, seen, found)
-        self._changed.append(sums.renew_levels(seen[:found], totals, levels, LEVEL_TABLE, marks))
+        self._changed.append(sums.renew_levels(seen[:found], totals, levels, level_table(), marks))
 
     def _runs(self, rows: FloatArray) -> tuple[Runs, Runs]:
         """Return the runs of the supports, and of the voxels that the segments pass through."""

@@ -8,7 +8,7 @@ import numpy as np
 from canopy_skel.ends import Ends
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, is_empty
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.kernels.candidates import link_candidates
+from canopy_skel.kernels import candidates as kernel
 
 Evidence = Callable[[FloatArray], IntArray]
 """Points (N, 3) -> counts of verdicts (N, 6)."""
@@ -95,7 +95,7 @@ def candidates_of(
     for number, v in enumerate(ends.vertex.tolist()):
         vertex_end[v, int(vertex_end[v, 0] >= 0)] = number
     count = int(parts.component.max(initial=-1)) + 1
-    end, vertex, other, rank = link_candidates(
+    end, vertex, other, rank = kernel.link_candidates(
         parts.points[ends.vertex],
         ends.tangents,
         parts.component[ends.vertex],

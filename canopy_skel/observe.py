@@ -7,9 +7,7 @@ import numpy as np
 from canopy_skel.evidence import ViewEvidence, evidence_of
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
-from canopy_skel.kernels import profile
-from canopy_skel.kernels.agree import agreement
-from canopy_skel.kernels.fuse import cell_keys
+from canopy_skel.kernels import agree, fuse, profile
 from canopy_skel.pieces import (
     Piece,
     PieceConfig,
@@ -64,7 +62,7 @@ class Observation:
 
         Wood lies along wood in view after view; leaves taken for wood seldom do.
         """
-        return agreement(
+        return agree.agreement(
             points_in_base,
             np.ascontiguousarray(directions),
             self.points_in_base[self.by_cell],
@@ -113,7 +111,7 @@ def observe(
         pieces += pieces_of(view, fragments, pieces_config, fragments=True)
         wood[fragments.v, fragments.u] = True
     points, directions, of = sampled(pieces)
-    cells = cell_keys(points, _NEAR_M)
+    cells = fuse.cell_keys(points, _NEAR_M)
     by_cell = np.argsort(cells, kind="stable")
     return Observation(
         splines=[piece.spline for piece in pieces if not piece.fragment],

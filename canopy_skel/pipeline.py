@@ -138,7 +138,7 @@ class Skeletonizer:
         config = self._config
         self._map = LikelihoodMap(config.likelihood, self._memory_limit_bytes)
         self._strands = StrandMap(config.likelihood.voxel_size_m, config.initial.smoothing)
-        self._search = PathSearch(self._map)
+        self._search: PathSearch | None = None
         self._initial: SkeletonGraph | None = None
         self._searched: SkeletonGraph | None = None
 
@@ -313,11 +313,12 @@ class Skeletonizer:
 
     def _repaired(self, initial: SkeletonGraph) -> PathSearch:
         """Return the search, repaired where views have changed G_init or the map."""
+        search = self._search = self._search or PathSearch(self._map)
         if self._searched is not initial:
             with self._stage("repair"):
-                self._search.update(initial)
+                search.update(initial)
             self._searched = initial
-        return self._search
+        return search
 
     def _joined(self, initial: SkeletonGraph, joins: list[Join]) -> SkeletonGraph:
         graph = add_paths(initial, joins, self._map)

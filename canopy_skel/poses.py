@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from canopy_skel.fusion import Observations, Observed
 from canopy_skel.geometry import FloatArray, IntArray, transform_from, transform_points
+from canopy_skel.kernels import aligning, fuse
+
+_MIN_COSINE = 0.9
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,14 +51,14 @@ def pose_corrections(
     """
     if len(fused.vertices_in_base) == 0:
         return []
-    tree = cKDTree(fused.vertices_in_base)
+    lines = _lines(fused, config.reach_m)
     found = []
     for view in np.unique(seen.view).tolist():
         chosen = np.flatnonzero((seen.view == view) & ~seen.fragment)
         if len(chosen) < config.min_points:
             continue
         points, directions = seen.points_in_base[chosen], seen.directions[chosen]
-        moved, before_m, after_m = _aligned(points, directions, fused, tree, config)
+        moved, before_m, after_m = _aligned(points, directions, lines, config)
         if before_m >= config.worst_m and after_m <= config.enough * before_m:
             found.append(PoseCorrection(view=view, moved=moved, before_m=before_m, after_m=after_m))
     return found
@@ -71,55 +73,65 @@ def corrected(seen: Observations, corrections: list[PoseCorrection]) -> FloatArr
     return points
 
 
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Lines:
+    """Vertices (V, 3) of the fused skeleton and their directions, by the keys of their cells."""
+
+    points: FloatArray
+    directions: FloatArray
+    keys: IntArray
+
+
+def _lines(fused: Observed, cell_m: float) -> _Lines:
+    keys = fuse.cell_keys(fused.vertices_in_base, cell_m)
+    order = np.argsort(keys, kind="stable")
+    return _Lines(
+        points=fused.vertices_in_base[order],
+        directions=fused.directions[order],
+        keys=keys[order],
+    )
+
+
 def _aligned(
-    points: FloatArray, directions: FloatArray, fused: Observed, tree: cKDTree, config: PoseConfig
+    points: FloatArray, directions: FloatArray, lines: _Lines, config: PoseConfig
 ) -> tuple[FloatArray, float, float]:
-    """Return the transform and the median distance across the wood before and after it."""
+    """Return the transform and the median distance across the wood before and after it.
+
+    A view that lies well enough stays as it is.
+    """
     moved, here = np.eye(4), points
     before_m = after_m = 0.0
     for step in range(config.rounds + 1):
-        near, index = _matches(here, directions, fused, tree, config)
+        near, index, off = aligning.offsets(
+            here,
+            directions,
+            lines.points,
+            lines.directions,
+            lines.keys,
+            config.reach_m,
+            _MIN_COSINE,
+        )
         if len(near) < config.min_points:
             return np.eye(4), before_m, np.inf
-        off = _across(fused.vertices_in_base[index] - here[near], fused.directions[index])
-        after_m = float(np.median(np.linalg.norm(off, axis=1)))
+        off_m = np.linalg.norm(off, axis=1)
+        after_m = float(np.median(off_m))
         before_m = after_m if step == 0 else before_m
+        if before_m < config.worst_m:
+            break
         if step < config.rounds:
-            moved = _small_move(here[near], off, fused.directions[index]) @ moved
+            weight = 1.0 / np.maximum(off_m, max(after_m, 1e-6))
+            moved = _small_move(here[near], off, lines.directions[index], weight) @ moved
             here = transform_points(moved, points)
     return moved, before_m, after_m
 
 
-def _matches(
-    points: FloatArray, directions: FloatArray, fused: Observed, tree: cKDTree, config: PoseConfig
-) -> tuple[IntArray, IntArray]:
-    distance, index = tree.query(points, distance_upper_bound=config.reach_m)
-    near = np.flatnonzero(np.isfinite(distance))
-    index = np.asarray(index, dtype=np.int64)[near]
-    along = np.abs(np.sum(directions[near] * fused.directions[index], axis=1)) > 0.9
-    return near[along].astype(np.int64), index[along]
-
-
-def _across(vectors: FloatArray, directions: FloatArray) -> FloatArray:
-    along = np.sum(vectors * directions, axis=1, keepdims=True)
-    return np.asarray(vectors - along * directions)
-
-
-def _small_move(points: FloatArray, off: FloatArray, directions: FloatArray) -> FloatArray:
+def _small_move(
+    points: FloatArray, off: FloatArray, directions: FloatArray, weight: FloatArray
+) -> FloatArray:
     """Return the rigid motion that takes most of `off` away: one robust Gauss-Newton step."""
     centre = points.mean(axis=0)
-    arm = points - centre
-    # d(point) = shift + turn x arm, seen across the wood only.
-    jacobian = np.zeros((len(points), 3, 6))
-    jacobian[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
-    for column in range(6):
-        jacobian[:, :, column] = _across(jacobian[:, :, column], directions)
-    size = np.linalg.norm(off, axis=1)
-    weight = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-6))
-    normal = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
-    right = np.einsum("nij,n,ni->j", jacobian, weight, off)
+    equations = aligning.normal_equations(points - centre, off, directions, weight)
+    normal, right = equations[:, :6], equations[:, 6]
     step = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(6), right)
     rotation = Rotation.from_rotvec(step[3:]).as_matrix()
     return transform_from(rotation, centre + step[:3] - rotation @ centre)

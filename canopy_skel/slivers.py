@@ -24,22 +24,24 @@ def inside_thicker(seen: Observations) -> BoolArray:
         thick = np.flatnonzero((seen.radius_m >= thick_m) & ~seen.fragment & ~swallowed)
         thin = np.flatnonzero((seen.radius_m < thick_m / _TIMES_THINNER) & ~swallowed)
         if len(thick) >= _NEAREST and len(thin):
-            swallowed[thin[_within(seen, thin, thick, 1.5 * thick_m)]] = True
+            swallowed[_within(seen, thin, thick, 1.5 * thick_m)] = True
     return swallowed
 
 
-def _within(seen: Observations, thin: IntArray, thick: IntArray, reach_m: float) -> BoolArray:
-    """Say which thin points (T,) lie within the wood of one of the nearest thick ones."""
+def _within(seen: Observations, thin: IntArray, thick: IntArray, reach_m: float) -> IntArray:
+    """Return which of the thin points (T,) lie within the wood of one of the nearest thick ones."""
     points = seen.points_in_base
-    distance_m, nearest = cKDTree(points[thick]).query(
-        points[thin], k=_NEAREST, distance_upper_bound=reach_m
+    distance_m, nearest = map(
+        np.asarray,
+        cKDTree(points[thick]).query(points[thin], k=_NEAREST, distance_upper_bound=reach_m),
     )
-    near = np.isfinite(distance_m)
-    other = thick[np.where(near, nearest, 0)]
+    some = np.isfinite(distance_m[:, 0])  # Few have any.
+    thin, near = thin[some], np.isfinite(distance_m[some])
+    other = thick[np.where(near, nearest[some], 0)]
     offset, axis = points[thin][:, None] - points[other], seen.directions[other]
     along_m = np.sum(offset * axis, axis=2)
     across_m = np.linalg.norm(offset - along_m[..., None] * axis, axis=2)
     parallel = np.abs(np.sum(seen.directions[thin][:, None] * axis, axis=2)) >= _MIN_COSINE
     radius_m = seen.radius_m[other]
     inside = (across_m < _INSIDE * radius_m) & (np.abs(along_m) < radius_m)
-    return np.asarray((near & parallel & inside).any(axis=1))
+    return np.asarray(thin[(near & parallel & inside).any(axis=1)])

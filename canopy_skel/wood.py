@@ -7,10 +7,14 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from canopy_skel.frame import Float32Array, View
+from canopy_skel.components import pixels_of, runs_of
+from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import BoolArray, IntArray
 from canopy_skel.pieces import Regions, depth_of
-from canopy_skel.woodpixels import PixelModel, layers_of
+from canopy_skel.woodpixels import PixelModel, lab_of, layers_of
+
+_SPREAD = 4
+"""Colours count up to so many bins from their own."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,49 +68,50 @@ def wood_probability(
     lies around them. One view alone, so that no other view changes its fragments.
     """
     probability = np.zeros(covered.shape, dtype=np.float32)
-    log_odds, mean_odds = colour_log_odds(view, covered, config)
+    lab = lab_of(view)
+    log_odds, mean_odds = colour_log_odds(view, lab, covered, config)
     v, u = asked_pixels(mean_odds, config)
     if len(v) == 0:
         return probability
-    layers = layers_of(view, covered, log_odds)
+    layers = layers_of(view, lab, covered, log_odds)
     probability[v, u] = model.probability(layers, mean_odds[v, u], v, u)
     return probability
 
 
 def asked_pixels(mean_odds: Float32Array, config: FragmentConfig) -> tuple[IntArray, IntArray]:
     """Return rows and columns of the pixels whose colour may be that of wood."""
-    v, u = np.nonzero(mean_odds >= config.min_log_odds)
-    return v.astype(np.int64), u.astype(np.int64)
+    v, u = np.divmod(np.flatnonzero(mean_odds >= config.min_log_odds), mean_odds.shape[1])
+    return v, u
 
 
 def colour_log_odds(
-    view: View, covered: BoolArray, config: FragmentConfig
+    view: View, lab: UInt8Array, covered: BoolArray, config: FragmentConfig
 ) -> tuple[Float32Array, Float32Array]:
     """Return log odds of wood by colour (H, W), and their means among pixels that are asked.
 
-    Wood is what the masks cover, the rest is taken for not wood; only pixels beside the masks at
-    the depths of the tree are asked, the means of others are negative infinite.
+    `lab` (H, W, 3): the picture, as `lab_of` gives it. Wood is what the masks cover, the rest is
+    taken for not wood; only pixels beside the masks at the depths of the tree are asked, the means
+    of others are negative infinite.
     """
     near = at_tree(view, covered, config)
     mean = np.full(covered.shape, -np.inf, dtype=np.float32)
     wood, other = near & covered, near & ~covered
     if not wood.any() or not other.any():
         return np.zeros(covered.shape, dtype=np.float32), mean
-    lab = cv2.cvtColor(view.color_rgb, cv2.COLOR_RGB2Lab)
-    bins = (
-        (lab[..., 0].astype(np.int32) >> 3 << 12)
-        | (lab[..., 1].astype(np.int32) >> 2 << 6)
-        | (lab[..., 2].astype(np.int32) >> 2)
-    )
+    lightness, *colours = (np.asarray(one, dtype=np.uint8) for one in cv2.split(lab))
+    bins = (lightness >> 3).astype(np.int32)
+    for one in colours:
+        bins <<= 6
+        bins |= one >> 2
     of_wood, of_other = (_histogram(bins[chosen]) for chosen in (wood, other))
     known = config.shrink_px * (of_wood + of_other) / (of_wood.sum() + of_other.sum()) + 1e-9
     share_wood = (of_wood + known) / (of_wood.sum() + known.sum())
     share_other = (of_other + known) / (of_other.sum() + known.sum())
-    log_odds = np.log(share_wood / share_other).astype(np.float32).ravel()[bins]
+    log_odds = np.log(share_wood / share_other).astype(np.float32).ravel().take(bins)
     # A pixel's neighbours are mostly what it is; noise is not.
     size = (config.blur_px, config.blur_px)
-    asked = cv2.blur(other.astype(np.float32), size)
-    mean[other] = cv2.blur(np.where(other, log_odds, np.float32(0)), size)[other] / asked[other]
+    beside = other.astype(np.float32)
+    np.divide(cv2.blur(log_odds * beside, size), cv2.blur(beside, size), out=mean, where=other)
     return log_odds, mean
 
 
@@ -124,21 +129,19 @@ def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray
 def fragments_of(
     probability: Float32Array, min_probability: float, config: FragmentConfig
 ) -> Regions:
-    """Return the connected components of probable wood, in raster order."""
-    wood = (probability >= min_probability).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(wood, connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA]
-    kept = (area >= config.min_px) & (area <= config.max_px)
-    kept[0] = False
-    number = np.zeros(count, dtype=np.int64)
-    number[kept] = np.arange(1, kept.sum() + 1)
-    v, u = np.nonzero(wood)
-    of = number[labels[v, u]]
-    v, u, of = v[of > 0], u[of > 0], of[of > 0]
-    order = np.argsort(of, kind="stable")
-    sizes = area[kept].astype(np.int64)
+    """Return the connected components of probable wood, in raster order of blocks of pixels."""
+    runs = runs_of(probability >= min_probability)
+    kept = np.flatnonzero((runs.area >= config.min_px) & (runs.area <= config.max_px))
+    # By the first block of 2 x 2 pixels that any pixel is in; within a component by row.
+    block = (runs.row // 2) * probability.shape[1] + runs.first_px // 2
+    first = np.full(len(block), probability.size)
+    np.minimum.at(first, runs.component, block)
+    order = kept[np.argsort(first[runs.component[kept]], kind="stable")]
+    v, u = pixels_of(runs, order)
+    of = runs.component[order]
+    heads = np.flatnonzero(np.diff(of, prepend=-1))
+    sizes = runs.area[order][heads]
     start = np.concatenate([[0], np.cumsum(sizes)])
-    v, u = v[order].astype(np.int64), u[order].astype(np.int64)
     mean = (
         np.add.reduceat(probability[v, u].astype(np.float64), start[:-1]) / sizes
         if len(sizes)
@@ -149,4 +152,15 @@ def fragments_of(
 
 def _histogram(bins: np.ndarray) -> np.ndarray:
     counts = np.bincount(bins, minlength=1 << 17).reshape(32, 64, 64).astype(np.float64)
-    return np.asarray(gaussian_filter(counts, 1.0, mode="nearest"))
+    used = np.array(np.nonzero(counts))
+    reach = (
+        slice(None)
+        if used.size == 0
+        else tuple(
+            slice(max(low - _SPREAD, 0), high + _SPREAD + 1)
+            for low, high in zip(used.min(axis=1), used.max(axis=1), strict=True)
+        )
+    )
+    # Few of the colours there are occur; beyond what is in reach of these, all is 0.
+    counts[reach] = gaussian_filter(counts[reach], 1.0, mode="nearest", radius=_SPREAD)
+    return counts

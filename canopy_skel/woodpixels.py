@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from canopy_skel.frame import Float32Array, View
+from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import BoolArray, IntArray
 from canopy_skel.kernels import around
 from canopy_skel.pieces import depth_of
@@ -50,16 +50,22 @@ class PixelModel:
         return np.asarray(1.0 / (1.0 + np.exp(-odds)), dtype=np.float32)
 
 
-def layers_of(view: View, covered: BoolArray, log_odds: Float32Array) -> Float32Array:
+def lab_of(view: View) -> UInt8Array:
+    """Return the picture (H, W, 3) as lightness and two colours."""
+    return np.asarray(cv2.cvtColor(view.color_rgb, cv2.COLOR_RGB2Lab), dtype=np.uint8)
+
+
+def layers_of(
+    view: View, lab: UInt8Array, covered: BoolArray, log_odds: Float32Array
+) -> Float32Array:
     """Return what the model looks at (H, W, 4); see `kernels.around`."""
-    lightness = cv2.cvtColor(view.color_rgb, cv2.COLOR_RGB2Lab)[..., 0].astype(np.float32) / 255
+    lightness = lab[..., 0].astype(np.float32) / 255
     clipped = np.clip(log_odds, -_MOST_ODDS, _MOST_ODDS)
     layers = [cv2.GaussianBlur(one, (0, 0), _BLUR_PX) for one in (clipped, lightness)]
-    depth_m = np.nan_to_num(depth_of(view), nan=0.0, posinf=0.0)
-    stacked = np.empty((*covered.shape, 4), dtype=np.float32)
-    for k, layer in enumerate((*layers, depth_m, covered)):
-        stacked[..., k] = layer
-    return stacked
+    depth_m = depth_of(view).copy()
+    cv2.patchNaNs(depth_m, 0.0)
+    depth_m[np.isinf(depth_m)] = 0.0
+    return np.asarray(cv2.merge([*layers, depth_m, covered.astype(np.float32)]), dtype=np.float32)
 
 
 def figures_of(

@@ -2,7 +2,8 @@
 
 Numba compiles a module as it is imported, on one core, and keeps the result on disk. Here every
 module is imported in some process of its own first, so that a first start waits half as long on
-two cores. Run as `python -m service.kernels` after installing.
+two cores; and only those that are about to be used. Run as `python -m service.kernels` after
+installing: that compiles all.
 
 Tried, to no gain: Numba's lower levels of optimisation (level 1 saves a tenth, of slower kernels),
 no vectorisers, no checks for division by zero, inner functions inlined before typing (all of them:
@@ -13,42 +14,43 @@ import gc
 import importlib
 import multiprocessing
 import os
-import pkgutil
 import sys
-from collections.abc import Collection
+from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 
+from canopy_skel.kernels import MODULES, NEEDED_BY
+
 PACKAGE = "canopy_skel.kernels"
-SELDOM = frozenset({"centreline", "strands", "volume"})
-"""Only learned masks and scores need these: a first start does not wait for them."""
 
 
-def compile_kernels(leaving_out: Collection[str] = SELDOM) -> None:
-    """Have kernels on disk; returns at once where any is there already, or none may be written.
+def compile_kernels(needed_by: Iterable[str]) -> None:
+    """Have on disk what methods and segmenters of these names need; those not listed need none."""
+    compile_modules(frozenset().union(*(NEEDED_BY.get(name, ()) for name in needed_by)))
 
-    What is left out, missing or out of date then is compiled on import, as ever.
+
+def compile_modules(names: Iterable[str]) -> None:
+    """Have kernels of these modules on disk; nothing to do where they are or may not be written.
+
+    A module counts as compiled if any kernel of it is there. What is missing or out of date then is
+    compiled when it is used, on one core.
     """
-    folder = _kept_in()
-    if not os.access(folder.parent, os.W_OK) or any(folder.rglob("*.nbi")):
+    source, kept = Path(str(files(PACKAGE))), _kept_in()
+    compiled = {path.name.split(".")[0] for path in kept.rglob("*.nbi")}
+    missing = sorted(set(names) - compiled)
+    if not missing or not os.access(kept.parent, os.W_OK):
         return
+    # The largest first: they take longest.
+    missing.sort(key=lambda name: -(source / f"{name}.py").stat().st_size)
     print("compiling the kernels, once", file=sys.stderr)  # noqa: T201 - before any other output
     spawn = multiprocessing.get_context("spawn")
     # What compiling makes lives as long as the process: looking for garbage takes a tenth of it.
-    with spawn.Pool(min(os.cpu_count() or 1, 8), initializer=gc.disable) as pool:
-        pool.map(_import, modules(leaving_out), chunksize=1)
+    with spawn.Pool(min(os.cpu_count() or 1, len(missing), 8), initializer=gc.disable) as pool:
+        pool.map(_import, missing, chunksize=1)
 
 
-def modules(leaving_out: Collection[str] = ()) -> list[str]:
-    """Return the names of all modules of kernels, the largest first: they take longest."""
-    folder = Path(str(files(PACKAGE)))
-    found = [info.name for info in pkgutil.iter_modules([str(folder)])]
-    found.sort(key=lambda name: -(folder / f"{name}.py").stat().st_size)
-    return [f"{PACKAGE}.{name}" for name in found if name not in leaving_out]
-
-
-def _import(module: str) -> None:
-    importlib.import_module(module)
+def _import(name: str) -> None:
+    importlib.import_module(f"{PACKAGE}.{name}")
 
 
 def _kept_in() -> Path:
@@ -58,4 +60,4 @@ def _kept_in() -> Path:
 
 
 if __name__ == "__main__":
-    compile_kernels(leaving_out=())
+    compile_modules(MODULES)

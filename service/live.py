@@ -93,7 +93,10 @@ class LiveSkeleton:
 
 
 def warm_up(stage: Stage) -> None:
-    """Compile (or load) every kernel by making a small skeleton: two sticks with a gap between."""
+    """Load (or compile) the kernels of all methods by small skeletons: two sticks, a gap between.
+
+    `mst` and `ftsem` need none that `paper` does not.
+    """
     size = (60, 160)
     instances = np.zeros(size, dtype=np.uint16)
     instances[28:32, 10:60], instances[28:32, 80:150] = 1, 2

@@ -16,7 +16,7 @@ from canopy_skel.pieces import depth_of, regions_of_masks
 from canopy_skel.recording import read_recording
 from canopy_skel.segment import Segmenter
 from canopy_skel.wood import asked_pixels, colour_log_odds, mask_image
-from canopy_skel.woodpixels import PixelModel, figures_of, layers_of
+from canopy_skel.woodpixels import PixelModel, figures_of, lab_of, layers_of
 from service.experiment.segmenters import segmenter_named
 from service.pixelfit import fit_pixels
 
@@ -85,7 +85,8 @@ def _pixels(view: View, finder: Segmenter, tree: cKDTree, radius_m: FloatArray) 
     depth_m = depth_of(view)
     covered = mask_image(view, regions_of_masks(finder.segment(view)))
     covered &= ~(depth_m > settings.pieces.farthest_m)
-    log_odds, mean_odds = colour_log_odds(view, covered, settings.fragments)
+    lab = lab_of(view)
+    log_odds, mean_odds = colour_log_odds(view, lab, covered, settings.fragments)
     v, u = asked_pixels(mean_odds, settings.fragments)
     surface = view.intrinsics.back_project(
         u.astype(np.float64), v.astype(np.float64), depth_m[v, u].astype(np.float64)
@@ -96,7 +97,7 @@ def _pixels(view: View, finder: Segmenter, tree: cKDTree, radius_m: FloatArray) 
     drawn = np.random.default_rng(view.index).random(len(v)) < shares
     v, u, wood, shares = v[drawn], u[drawn], wood[drawn], shares[drawn]
     return Pixels(
-        figures=figures_of(layers_of(view, covered, log_odds), mean_odds[v, u], v, u),
+        figures=figures_of(layers_of(view, lab, covered, log_odds), mean_odds[v, u], v, u),
         wood=wood,
         weights=(1.0 / shares).astype(np.float32),
     )

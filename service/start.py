@@ -1,12 +1,11 @@
-"""Where the `canopy` program begins."""
+"""Where the `canopy` program begins.
 
-from service.kernels import compile_kernels
+Nothing is imported here: the processes that compile kernels import this module again.
+"""
 
 
 def main() -> None:
-    """Run the command line, with its kernels compiled."""
-    compile_kernels()
-    # Imported after that: importing compiles what is missing, on one core.
+    """Run the command line."""
     from service.cli import main as run
 
     run()

@@ -26,10 +26,13 @@ import zenoh
 
 from canopy_skel.errors import CanopyError
 from canopy_skel.messages import encode_json
+from canopy_skel.pipeline import METHODS
 from service.bus import ENCODING_JSON, ENCODING_PROBLEM, Keys, open_session
 from service.envelope import ViewEnvelope, decode_envelope
 from service.heartbeat import PERIOD_S, Heartbeat, Version
+from service.kernels import compile_kernels
 from service.live import LiveSkeleton, warm_up
+from service.skeletons import SEGMENTERS
 
 SCANS_KEPT = 2
 _log = logging.getLogger(__name__)
@@ -216,6 +219,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     try:
         keys = Keys(site=options.site, rig=options.rig)
         keys.worker(options.id)
+        compile_kernels((*METHODS, *SEGMENTERS))
         with (
             open_session(connect=options.connect) as session,
             Worker(session, keys, options.id).running(),

@@ -38,8 +38,9 @@ def report(quick, _output, kept):
     head = ("method", "kernels", "clock s", "CPU s of all processes", "load before")
     text += table(f"`canopy replay` of {RECORDING.stem} (4 views), start to end", head, rows)
     text += (
-        f"\nOn {os.cpu_count()} cores. Load: jobs that ran or waited on average in the minute"
-        " before; at more than 0 the clock shows other jobs too.\n"
+        f"\nOn {os.cpu_count()} cores. With no kernels yet, those a method needs are compiled"
+        " first, on all cores, and no others. Load: jobs that ran or waited on average in the"
+        " minute before; at more than 0 the clock shows other jobs too.\n"
     )
     facts = {(kernels, method): clock for method, kernels, clock, *_ in rows}
     return text, facts | {"memory": peak}

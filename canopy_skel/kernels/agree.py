@@ -1,11 +1,9 @@
 """Which points of one view lie along points of another."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.cells import cell_key, first_at
+from canopy_skel.kernels.cells import most_rows, no_box, rows_around
 from canopy_skel.kernels.compiled import kernel
 
 Floats = NDArray[np.float64]
@@ -38,30 +36,20 @@ def agreement(
     between the directions of at least `min_cosine`.
     """
     found = np.zeros((len(points), AGREEMENT), dtype=np.int64)
+    box, rows = no_box(), np.zeros((most_rows(reach_m, cell_m), 2), dtype=np.int64)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        for x in range(
-            math.floor((px - reach_m) / cell_m), math.floor((px + reach_m) / cell_m) + 1
-        ):
-            for y in range(
-                math.floor((py - reach_m) / cell_m), math.floor((py + reach_m) / cell_m) + 1
-            ):
-                low = cell_key(x, y, math.floor((pz - reach_m) / cell_m))
-                high = cell_key(x, y, math.floor((pz + reach_m) / cell_m))
-                j = first_at(keys, low)
-                while j < len(keys) and keys[j] <= high:
-                    wx = references[j, 0] - px
-                    wy = references[j, 1] - py
-                    wz = references[j, 2] - pz
-                    squared = wx * wx + wy * wy + wz * wz
-                    along = wx * dx + wy * dy + wz * dz
-                    if squared <= reach_m**2 and squared - along * along <= across_m**2:
-                        found[i, 0] = 1
-                        cosine = dx * reference_directions[j, 0]
-                        cosine += dy * reference_directions[j, 1]
-                        cosine += dz * reference_directions[j, 2]
-                        if abs(cosine) >= min_cosine:
-                            found[i, 2 if fragment[j] else 1] = 1
-                    j += 1
+        for row in range(rows_around(px, py, pz, reach_m, cell_m, keys, box, rows)):
+            for j in range(rows[row, 0], rows[row, 1]):
+                wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
+                squared = wx * wx + wy * wy + wz * wz
+                along = wx * dx + wy * dy + wz * dz
+                if squared <= reach_m**2 and squared - along * along <= across_m**2:
+                    found[i, 0] = 1
+                    cosine = dx * reference_directions[j, 0]
+                    cosine += dy * reference_directions[j, 1]
+                    cosine += dz * reference_directions[j, 2]
+                    if abs(cosine) >= min_cosine:
+                        found[i, 2 if fragment[j] else 1] = 1
     return found

@@ -130,7 +130,8 @@ def wood_log_odds(
     hidden = np.zeros(len(first_bias), dtype=np.float32)
     for i in range(len(v)):
         pixel_figures(layers, mean_odds, v, u, offsets, row, ring, i)
-        hidden[:] = first_bias
+        for k in range(len(hidden)):
+            hidden[k] = first_bias[k]
         for j in range(FIGURES):
             for k in range(len(hidden)):
                 hidden[k] += row[j] * first[j, k]

@@ -2,9 +2,9 @@
 
 Callers must pass these types: arrays of this dtype, C-contiguous where the signature has `::1`,
 and writable. Most of compiling is Numba's own Python, so what is compiled is kept small: a wrapper
-only for what Python calls, none for C; loops instead of `np.linalg`, `np.sort`, `np.median` and
-assignments to slices, which take a second or more each. No module with kernels that Python calls
-imports another: processes that compile one each would compile both.
+only for what Python calls, none for C; loops instead of `np.linalg`, `np.sort`, `np.median`,
+arithmetic of whole arrays and assignments to slices, which take a second or more each. No module
+with kernels that Python calls imports another: processes that compile one each would compile both.
 """
 
 from collections.abc import Callable

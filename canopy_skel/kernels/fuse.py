@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canopy_skel.kernels.across import draw
-from canopy_skel.kernels.cells import cell_key, first_at
+from canopy_skel.kernels.cells import cell_key, most_rows, no_box, rows_around
 from canopy_skel.kernels.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
@@ -25,25 +25,75 @@ def cell_keys(points: Floats, cell_m: float) -> Ints:
     return keys
 
 
-@inner("int64(float64[:,::1], int64, float64, float64[:,::1], int64[::1], float64, int64[::1])")
+@inner(
+    "int64(float64, float64, float64, float64, float64[:,::1], int64[::1], float64, int64[::1],"
+    " int64[:,::1], int64[::1], float64[::1])"
+)
 def near(
-    points: Floats, i: int, reach: float, references: Floats, keys: Ints, cell_m: float, found: Ints
+    px: float,
+    py: float,
+    pz: float,
+    reach_m: float,
+    references: Floats,
+    keys: Ints,
+    cell_m: float,
+    box: Ints,
+    rows: Ints,
+    found: Ints,
+    squared: Floats,
 ) -> int:
-    """Write which references (R, 3), sorted by `keys` of their cells, point i reaches; how many."""
-    px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+    """Write which references (R, 3), sorted by `keys` of their cells, lie within reach; how many.
+
+    Also writes the squares of their distances. `box` and `rows`: see `rows_around`.
+    """
     count = 0
-    for x in range(math.floor((px - reach) / cell_m), math.floor((px + reach) / cell_m) + 1):
-        for y in range(math.floor((py - reach) / cell_m), math.floor((py + reach) / cell_m) + 1):
-            low = cell_key(x, y, math.floor((pz - reach) / cell_m))
-            high = cell_key(x, y, math.floor((pz + reach) / cell_m))
-            j = first_at(keys, low)
-            while j < len(keys) and keys[j] <= high:
-                wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
-                if wx * wx + wy * wy + wz * wz <= reach * reach:
-                    found[count] = j
-                    count += 1
-                j += 1
+    for row in range(rows_around(px, py, pz, reach_m, cell_m, keys, box, rows)):
+        for j in range(rows[row, 0], rows[row, 1]):
+            wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
+            # Written always and counted at times: no branch to guess wrong.
+            found[count], squared[count] = j, wx * wx + wy * wy + wz * wz
+            count += squared[count] <= reach_m * reach_m
     return count
+
+
+@inner(
+    "int64(float64[::1], float64[:,::1], float64, float64[::1], float64, int64, int64[::1],"
+    " float64[::1], float64[::1])"
+)
+def weigh_along(
+    direction: Floats,
+    directions: Floats,
+    min_cosine: float,
+    weights: Floats,
+    width: float,
+    count: int,
+    found: Ints,
+    squared: Floats,
+    cosines: Floats,
+) -> int:
+    """Keep of what was found that which runs along a direction, write its cosines; how many.
+
+    Their squared distances become their weights.
+    """
+    kept, dx, dy, dz = 0, direction[0], direction[1], direction[2]
+    for n in range(count):
+        j = found[n]
+        cosine = dx * directions[j, 0] + dy * directions[j, 1] + dz * directions[j, 2]
+        found[kept], squared[kept], cosines[kept] = j, squared[n], cosine
+        kept += abs(cosine) >= min_cosine
+    # By themselves: a call among sums would put all of them aside.
+    for n in range(kept):
+        squared[n] = weights[found[n]] * math.exp(-0.5 * squared[n] / (width * width))
+    return kept
+
+
+@inner("float64(float64[::1], float64, float64)")
+def widest(radii: Floats, bandwidth_m: float, radius_share: float) -> float:
+    """Return the largest bandwidth of any point."""
+    width = bandwidth_m
+    for i in range(len(radii)):
+        width = max(width, radius_share * radii[i])
+    return width
 
 
 @inner("int64(int64)")
@@ -86,25 +136,29 @@ def shift_across(
     points, the mean directions, and the support (P, SUPPORT).
     """
     moved, turned = points.copy(), directions.copy()
-    support, found = np.zeros((len(points), SUPPORT)), np.zeros(len(references), dtype=np.int64)
+    support, found = np.zeros((len(points), SUPPORT)), np.zeros(len(references) + 1, dtype=np.int64)
+    squared, cosines = np.zeros(len(found)), np.zeros(len(found))
+    reach_m = 2.0 * widest(radii, bandwidth_m, radius_share)
+    box, rows = no_box(), np.zeros((most_rows(reach_m, cell_m), 2), dtype=np.int64)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         width = max(bandwidth_m, radius_share * radii[i])
+        count = near(px, py, pz, 2.0 * width, references, keys, cell_m, box, rows, found, squared)
+        count = weigh_along(
+            directions[i], reference_directions, min_cosine, weights, width, count, found, squared,
+            cosines,
+        )  # fmt: skip
         total, bits = 0.0, 0
         ox = oy = oz = ex = ey = ez = r = mean_p = masks = largest = 0.0
-        for n in range(near(points, i, 2.0 * width, references, keys, cell_m, found)):
-            j = found[n]
-            rx, ry = reference_directions[j, 0], reference_directions[j, 1]
-            rz = reference_directions[j, 2]
-            cosine = directions[i, 0] * rx + directions[i, 1] * ry + directions[i, 2] * rz
-            if abs(cosine) < min_cosine:
-                continue
-            wx, wy, wz = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
-            weight = weights[j] * math.exp(-0.5 * (wx * wx + wy * wy + wz * wz) / (width * width))
-            signed = weight if cosine > 0.0 else -weight
+        for n in range(count):
+            j, weight = found[n], squared[n]
+            signed = weight if cosines[n] > 0.0 else -weight
             total, masks = total + weight, masks + (0.0 if fragment[j] else weight)
-            ox, oy, oz = ox + weight * wx, oy + weight * wy, oz + weight * wz
-            ex, ey, ez = ex + signed * rx, ey + signed * ry, ez + signed * rz
+            ox, oy = ox + weight * (references[j, 0] - px), oy + weight * (references[j, 1] - py)
+            oz = oz + weight * (references[j, 2] - pz)
+            ex = ex + signed * reference_directions[j, 0]
+            ey = ey + signed * reference_directions[j, 1]
+            ez = ez + signed * reference_directions[j, 2]
             r, mean_p = r + weight * reference_radii[j], mean_p + weight * probability[j]
             largest, bits = max(largest, probability[j]), bits | view_bits[j]
         if draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i]):
@@ -133,40 +187,50 @@ def spread_around(
     bandwidth, with Gaussian weights. `own_share` of the bandwidth squared is added along their own
     `directions` (R, 3).
     """
-    spread, found = np.zeros((len(chosen), 3, 3)), np.zeros(len(references), dtype=np.int64)
-    way, mean = np.zeros(3), np.zeros(3)
+    spread, found = np.zeros((len(chosen), 3, 3)), np.zeros(len(references) + 1, dtype=np.int64)
+    squared, reach_m = np.zeros(len(found)), 2 * bandwidth_m
+    box, rows = no_box(), np.zeros((most_rows(reach_m, cell_m), 2), dtype=np.int64)
     own = own_share * bandwidth_m**2
     for c in range(len(chosen)):
-        i, total = chosen[c], 0.0
-        for a in range(3):
-            mean[a] = 0.0
-        for n in range(near(references, i, 2 * bandwidth_m, references, keys, cell_m, found)):
-            squared = 0.0
-            for a in range(3):
-                way[a] = references[found[n], a] - references[i, a]
-                squared += way[a] * way[a]
-            weight = weights[found[n]] * math.exp(-0.5 * squared / bandwidth_m**2)
-            total += weight
-            for a in range(3):
-                mean[a] += weight * way[a]
-                for b in range(3):
-                    spread[c, a, b] += weight * way[a] * way[b]
-        for a in range(3):
-            for b in range(3):
-                square = spread[c, a, b] - mean[a] * mean[b] / total
-                spread[c, a, b] = square / total + own * directions[i, a] * directions[i, b]
+        i = chosen[c]
+        px, py, pz = references[i, 0], references[i, 1], references[i, 2]
+        count = near(px, py, pz, reach_m, references, keys, cell_m, box, rows, found, squared)
+        for n in range(count):
+            squared[n] = weights[found[n]] * math.exp(-0.5 * squared[n] / bandwidth_m**2)
+        total = mx = my = mz = xx = yx = yy = zx = zy = zz = 0.0
+        for n in range(count):
+            j, weight = found[n], squared[n]
+            x, y, z = references[j, 0] - px, references[j, 1] - py, references[j, 2] - pz
+            total, mx, my, mz = total + weight, mx + weight * x, my + weight * y, mz + weight * z
+            xx, yx, yy = xx + weight * x * x, yx + weight * y * x, yy + weight * y * y
+            zx, zy, zz = zx + weight * z * x, zy + weight * z * y, zz + weight * z * z
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        spread[c, 0, 0] = (xx - mx * mx / total) / total + own * dx * dx
+        spread[c, 1, 1] = (yy - my * my / total) / total + own * dy * dy
+        spread[c, 2, 2] = (zz - mz * mz / total) / total + own * dz * dz
+        spread[c, 1, 0] = spread[c, 0, 1] = (yx - my * mx / total) / total + own * dy * dx
+        spread[c, 2, 0] = spread[c, 0, 2] = (zx - mz * mx / total) / total + own * dz * dx
+        spread[c, 2, 1] = spread[c, 1, 2] = (zy - mz * my / total) / total + own * dz * dy
     return spread
 
 
-@kernel("boolean[::1](int64[::1], int64[::1], int64[::1])")
-def thinned(order: Ints, start: Ints, neighbours: Ints) -> NDArray[np.bool_]:
-    """Keep, in this order, each point none of whose neighbours is kept already."""
-    kept = np.zeros(len(order), dtype=np.bool_)
-    for n in range(len(order)):
-        i, free = order[n], True
-        for k in range(start[i], start[i + 1]):
-            if kept[neighbours[k]]:
-                free = False
-                break
-        kept[i] = free
+@kernel("boolean[::1](float64[:,::1], int64[::1], int64[::1], float64, float64)")
+def thinned(
+    points: Floats, order: Ints, keys: Ints, cell_m: float, spacing_m: float
+) -> NDArray[np.bool_]:
+    """Keep, in this order, each point (P, 3) that lies farther than the spacing from all kept.
+
+    Points lie sorted by the `keys` of their cells of `cell_m`.
+    """
+    kept, covered = np.zeros(len(points), dtype=np.bool_), np.zeros(len(points), dtype=np.bool_)
+    found, squared = np.zeros(len(points) + 1, dtype=np.int64), np.zeros(len(points) + 1)
+    box, rows = no_box(), np.zeros((most_rows(spacing_m, cell_m), 2), dtype=np.int64)
+    for i in order:
+        if covered[i]:
+            continue
+        kept[i] = True
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        count = near(px, py, pz, spacing_m, points, keys, cell_m, box, rows, found, squared)
+        for n in range(count):
+            covered[found[n]] = True
     return kept

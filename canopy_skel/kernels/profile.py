@@ -317,22 +317,38 @@ def fit_regions(
     return counts, knots, quality
 
 
+@inner("float64(float64[::1])")
+def norm(vector: Floats) -> float:
+    """Return the length of a vector (3,)."""
+    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
 @kernel("void(float64[:,:,::1], int64[::1], float64[::1])")
 def shift_away(points: Floats, counts: Ints, shift_m: Floats) -> None:
     """Move the knots (R, MAX_KNOTS, 3) of R lines, the first counts[i] of each, away from the eye.
 
     By shift_m (R,), along the part of the ray across the line; not where that is next to nothing.
     """
+    line, along, ray = np.empty((MAX_KNOTS, 3)), np.empty(3), np.empty(3)
     for i in range(len(counts)):
-        line = points[i, : counts[i]].copy()
         for k in range(counts[i]):
-            along = line[min(k + 1, counts[i] - 1)] - line[max(k - 1, 0)]
-            along /= max(math.sqrt((along * along).sum()), 1e-12)
-            ray = line[k] / math.sqrt((line[k] * line[k]).sum())
-            across = ray - (ray * along).sum() * along
-            norm = math.sqrt((across * across).sum())
-            if norm > 0.05:
-                points[i, k] += shift_m[i] / norm * across
+            for c in range(3):
+                line[k, c] = points[i, k, c]
+        for k in range(counts[i]):
+            before, after = max(k - 1, 0), min(k + 1, counts[i] - 1)
+            for c in range(3):
+                along[c], ray[c] = line[after, c] - line[before, c], line[k, c]
+            long, far = max(norm(along), 1e-12), norm(ray)
+            dot = 0.0
+            for c in range(3):
+                along[c], ray[c] = along[c] / long, ray[c] / far
+                dot += ray[c] * along[c]
+            for c in range(3):
+                ray[c] -= dot * along[c]
+            across = norm(ray)
+            if across > 0.05:
+                for c in range(3):
+                    points[i, k, c] += shift_m[i] / across * ray[c]
 
 
 @kernel("Tuple((float64[:,::1], float64[:,::1], int64[::1]))(float64[:,::1], int64[::1], float64)")
@@ -341,29 +357,30 @@ def sample_lines(knots: Floats, start: Ints, step_m: float) -> tuple[Floats, Flo
 
     Line i has the knots (N, 3) start[i] up to start[i + 1]; one of no length has no points.
     """
-    length = np.zeros(len(knots))
+    length, step = np.zeros(len(knots)), np.empty(3)
+    ways, counts = np.zeros(len(start) - 1), np.zeros(len(start) - 1, dtype=np.int64)
     total = 0
-    counts = np.zeros(len(start) - 1, dtype=np.int64)
     for i in range(len(counts)):
-        way = 0.0
         for k in range(start[i], start[i + 1] - 1):
-            step = knots[k + 1] - knots[k]
-            length[k] = math.sqrt((step * step).sum())
-            way += length[k]
-        if way >= 1e-6:
-            counts[i] = max(2, math.ceil(way / step_m) + 1)
+            for c in range(3):
+                step[c] = knots[k + 1, c] - knots[k, c]
+            length[k] = norm(step)
+            ways[i] += length[k]
+        if ways[i] >= 1e-6:
+            counts[i] = max(2, math.ceil(ways[i] / step_m) + 1)
         total += counts[i]
     points, directions = np.zeros((total, 3)), np.zeros((total, 3))
     of, n = np.zeros(total, dtype=np.int64), 0
     for i in range(len(counts)):
-        way = length[start[i] : start[i + 1] - 1].sum()
         k, before = start[i], 0.0
         for j in range(counts[i]):
-            at = way * j / (counts[i] - 1)
+            at = ways[i] * j / (counts[i] - 1)
             while k < start[i + 1] - 2 and at >= before + length[k]:
                 before += length[k]
                 k += 1
-            unit = (knots[k + 1] - knots[k]) / max(length[k], 1e-12)
-            points[n], directions[n], of[n] = knots[k] + (at - before) * unit, unit, i
+            for c in range(3):
+                unit = (knots[k + 1, c] - knots[k, c]) / max(length[k], 1e-12)
+                points[n, c], directions[n, c] = knots[k, c] + (at - before) * unit, unit
+            of[n] = i
             n += 1
     return points, directions, of

@@ -16,6 +16,7 @@ from service.cli.shell import WIDEST_RANGE, AsJson, Exit, Out, progress_bars, st
 from service.experiment.orchard import Choice, Orchard, read_orchard
 from service.experiment.report import Report, rows_csv
 from service.experiment.rows import Row, RowStore
+from service.kernels import compile_kernels
 from service.outputs import require_writable, write_all
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ def paper_table(
         jobs=jobs,
     )
     store = RowStore(output / STORE)
+    compile_kernels([*plan.methods, *plan.segmenters])
     with progress_bars() as progress:
         rows = run(plan, store, _show(progress, progress.add_task("trees", total=None)))
     options = {

@@ -7,6 +7,7 @@ import typer
 
 from canopy_skel.errors import UsageError
 from service.cli.shell import progress_bars, stderr
+from service.kernels import compile_kernels
 
 WORSE_MASKS = ("drop25+false20", "unet")
 """What the shipped confidences of learned masks are fitted to, beside recorded ones."""
@@ -43,6 +44,7 @@ def fit_confidence(
     if output.is_dir():
         raise UsageError(f"{output} is a folder; name the JSON file to write")
     masks = ("recorded", *(segmenter or WORSE_MASKS))
+    compile_kernels(["canopy", *masks])
     pixel_models = pixel_models_without(recordings)
     lessons = []
     with progress_bars() as progress:

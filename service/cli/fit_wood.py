@@ -7,6 +7,7 @@ import typer
 
 from canopy_skel.errors import UsageError
 from service.cli.shell import stderr
+from service.kernels import compile_kernels
 
 MASKS = ("recorded",)
 """The masks that the model sees wood beside: with worse ones it finds less beside good ones."""
@@ -28,6 +29,7 @@ def fit_wood(
 
     if output.is_dir():
         raise UsageError(f"{output} is a folder; name the JSON file to write")
+    compile_kernels(["canopy"])
     model = pixel_model_of(recordings, MASKS)
     if model is None:
         raise UsageError("no view has a depth image, stereo pairs only; add scans that have them")

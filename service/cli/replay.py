@@ -14,6 +14,7 @@ from canopy_skel.exports import FORMATS
 from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
 from service.cli.shell import AsJson, Exit, Out, complain, progress_bars, stderr, topic_options
 from service.doctor import available_memory_bytes
+from service.kernels import compile_kernels
 from service.outputs import require_writable
 from service.replay import ReplayRequest, ReplayResult
 from service.replay import replay as replay_recording
@@ -64,6 +65,7 @@ def replay(
     )
     _require_distinct_stems(recordings)
     require_writable(output)
+    compile_kernels([method, segmenter])
     results: list[dict[str, object]] = []
     codes = [_replay_one(path, output, request, results, quiet=as_json) for path in recordings]
     if as_json:

@@ -6,7 +6,10 @@ from typing import Annotated
 import typer
 
 from canopy_skel.errors import UsageError
+from canopy_skel.pipeline import METHODS
+from service.kernels import compile_kernels
 from service.outputs import require_writable
+from service.skeletons import SEGMENTERS
 
 
 def serve(
@@ -37,6 +40,7 @@ def serve(
     if sim == (robot is not None):
         raise UsageError("give either --sim or --robot HOST")
     require_writable(data)
+    compile_kernels((*METHODS, *SEGMENTERS))
     options = ServeOptions(
         data=data,
         robot=robot,

@@ -215,7 +215,7 @@ def test_wood_of_the_next_row_is_not_of_this_tree():
     there = transform_points(
         view.base_from_camera, back_projected(view, behind & np.isfinite(view.depth_m))
     )
-    assert not np.any(seen.evidence.classify(there) == WOOD_SEEN)
+    assert not count_evidence(there, [seen.evidence])[:, WOOD_SEEN].any()
     wider = observe(view, list(masks), PieceConfig(farthest_m=5.0), FragmentConfig())
     assert len(wider.splines) == 3
 

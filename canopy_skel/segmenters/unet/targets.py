@@ -9,7 +9,7 @@ import numpy as np
 
 from canopy_skel.frame import Float32Array, UInt8Array
 from canopy_skel.geometry import FloatArray
-from canopy_skel.kernels.centreline import nearest_on_lines
+from canopy_skel.kernels import centreline
 from canopy_skel.segmenters.labels import LabelledImage
 
 STRIDE = 2
@@ -47,7 +47,7 @@ def targets_of(image: LabelledImage) -> UInt8Array:
     lines = [_evened(line) for line in image.lines]
     starts = np.cumsum([0, *map(len, lines)]).astype(np.int64)
     near = np.zeros((*instances.shape, 3), dtype=np.float32)
-    nearest_on_lines(instances, np.concatenate(lines), starts, STRIDE, near)
+    centreline.nearest_on_lines(instances, np.concatenate(lines), starts, STRIDE, near)
     band = np.maximum(_CENTRE_RADII * near[..., 2], _CENTRE_LEAST_PX)
     maps[..., CENTRE] = (instances > 0) & (near[..., 0] <= band)
     maps[..., ANGLE] = np.rint(np.mod(near[..., 1], np.pi) / np.pi * ANGLE_STEPS) % ANGLE_STEPS
