@@ -107,7 +107,7 @@ def test_fit_wood_writes_a_model_that_knows_where_it_comes_from(canopy, tmp_path
     write(path, [leafy_view(0), leafy_view(1, y=0.1)], to_json(truth))
     assert canopy("fit-wood", path, "-o", output)[0] == 0
     model = pixel_model_from(json.loads(output.read_bytes()))
-    assert model.provenance == "fitted to 1 scans (masks recorded, drop25+false20): leafy"
+    assert model.provenance == "fitted to 1 scans (masks recorded): leafy"
     assert pixel_model_to(model) == output.read_bytes()
 
 
