@@ -53,7 +53,7 @@ _ROWS = 20000
 """So many at once go into the sums of a fit."""
 
 
-def fit_logistic(figures: FloatArray, right: ArrayLike, ridge: float = 10.0) -> Logistic:
+def fit_logistic(figures: FloatArray, right: ArrayLike, ridge: float = 100.0) -> Logistic:
     """Fit by Newton's method: figures (N, F), right (N,) bool; `ridge` keeps weights finite.
 
     Nothing to learn from gives even odds.
