@@ -88,7 +88,8 @@ def fit_logistic(figures: FloatArray, right: ArrayLike, ridge: float = 100.0) ->
 
 
 def _standard(figures: FloatArray, means: ArrayLike, scales: ArrayLike) -> FloatArray:
-    return np.clip((figures - np.asarray(means)) / np.asarray(scales), -FARTHEST, FARTHEST)
+    standard = (figures - np.asarray(means)) / np.asarray(scales)
+    return np.asarray(np.clip(standard, -FARTHEST, FARTHEST))
 
 
 def _terms(standard: FloatArray) -> FloatArray:

@@ -74,7 +74,7 @@ def _trained(rows: torch.Tensor) -> nn.Sequential:
                     odds, batch[:, -2], weight=batch[:, -1]
                 )
                 steps.zero_grad()
-                loss.backward()
+                loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
                 steps.step()
                 rates.step()
     return net
