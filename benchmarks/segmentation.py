@@ -181,8 +181,9 @@ def trained(facts):
         " the segmenter does in an orchard.",
         "",
         f"Trained for {training['steps']} steps of {training['plan'][0]['batch']} crops"
-        f" in {len(training['plan'])} runs ({training['minutes']:g} minutes of wall time on a shared"
-        f" core, {training['pictures']} pictures). [log.jsonl](log.jsonl); ![curves](curves.png)",
+        f" in {len(training['plan'])} runs ({training['minutes']:g} minutes of wall time on a"
+        f" shared core, {training['pictures']} pictures)."
+        " [log.jsonl](log.jsonl); ![curves](curves.png)",
         "",
         "## Validation of another kind",
         "",
