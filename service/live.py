@@ -95,17 +95,18 @@ class LiveSkeleton:
 def warm_up(stage: Stage) -> None:
     """Load (or compile) the kernels of all methods by small skeletons: two sticks, a gap between.
 
-    `mst` and `ftsem` need none that `paper` does not.
+    The sticks are long enough for a pose to be told by them. `mst` and `ftsem` need no kernel that
+    `paper` does not.
     """
-    size = (60, 160)
+    size = (60, 320)
     instances = np.zeros(size, dtype=np.uint16)
-    instances[28:32, 10:60], instances[28:32, 80:150] = 1, 2
+    instances[28:32, 10:140], instances[28:32, 160:310] = 1, 2
     view = View(
         index=0,
         stamp_ns=0,
         color_rgb=np.zeros((*size, 3), dtype=np.uint8),
         intrinsics=Intrinsics(
-            fx_px=300, fy_px=300, cx_px=80, cy_px=30, width_px=size[1], height_px=size[0]
+            fx_px=300, fy_px=300, cx_px=160, cy_px=30, width_px=size[1], height_px=size[0]
         ),
         base_from_camera=np.eye(4),
         depth_m=np.ones(size, dtype=np.float32),
