@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from canopy_skel.errors import UsageError
 from canopy_skel.kernels import MODULES, NEEDED_BY
+from canopy_skel.kernels.compiled import kernel
 from canopy_skel.pipeline import METHODS
 from service.kernels import STAMP, compile_modules
 
@@ -136,6 +138,13 @@ def test_what_other_sources_gave_is_compiled_again(tmp_path):
 def test_nothing_is_compiled_where_kernels_run_uncompiled(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     assert run(tmp_path, "-m", "service.kernels") == ""
+
+
+def test_without_a_folder_to_keep_kernels_in_the_mend_is_named():
+    space = {"__name__": "nowhere"}
+    exec(compile("def twice(n):\n    return 2 * n\n", "<nowhere>", "exec"), space)
+    with pytest.raises(UsageError, match="set NUMBA_CACHE_DIR"):
+        kernel("int64(int64)")(space["twice"])
 
 
 def test_a_folder_for_kernels_is_made(tmp_path):
