@@ -6,7 +6,6 @@ python benchmarks/segmentation.py FOLDER ../shared/data/recordings --output DIR
 import argparse
 import json
 import os
-import shutil
 from pathlib import Path
 from time import process_time
 
@@ -53,17 +52,27 @@ def main():
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    log = arguments.folder / "run" / "log.jsonl"
-    shutil.copy(log, arguments.output / "log.jsonl")
-    curves(log, arguments.output / "curves.png")
+    entries = log_of(arguments.folder)
+    lines = [json.dumps(entry) + "\n" for entry in entries]
+    (arguments.output / "log.jsonl").write_text("".join(lines))
+    curves(entries, arguments.output / "curves.png")
     validate = halves_of(StoredImages(arguments.folder / "data" / "validate"))
     sheet(validate.report, arguments.output / "sheet.jpg")
     results = [compared(arguments.recordings / f"{name}.mcap") for name in RECORDINGS]
     (arguments.output / "README.md").write_text(page(results, speed()))
 
 
-def curves(log, path):
-    entries = [json.loads(line) for line in log.read_text().splitlines()]
+def log_of(folder):
+    """Return the log of all runs; steps and minutes are counted on from the run before."""
+    entries, before = [], {"step": 0, "minutes": 0.0}
+    for path in sorted(folder.glob("run*/log.jsonl")):
+        own = [json.loads(line) for line in path.read_text().splitlines()]
+        entries += [entry | {name: entry[name] + before[name] for name in before} for entry in own]
+        before = {name: entries[-1][name] for name in before}
+    return entries
+
+
+def curves(entries, path):
     steps = [entry["step"] for entry in entries]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
     for axis, names, title in (
@@ -171,9 +180,10 @@ def trained(facts):
         "Made by `benchmarks/segmentation.py`. Every picture is synthetic: nothing here says how"
         " the segmenter does in an orchard.",
         "",
-        f"Trained for {training['steps']} steps of {training['plan']['batch']} crops"
-        f" ({training['minutes']:g} minutes of wall time on a shared core, "
-        f"{training['pictures']} pictures). [log.jsonl](log.jsonl); ![curves](curves.png)",
+        f"Trained for {training['steps']} steps of {training['plan'][0]['batch']} crops"
+        f" in {len(training['plan'])} runs ({training['minutes']:g} minutes of wall time on a"
+        f" shared core, {training['pictures']} pictures)."
+        " [log.jsonl](log.jsonl); ![curves](curves.png)",
         "",
         "## Validation of another kind",
         "",

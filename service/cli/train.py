@@ -100,7 +100,7 @@ def _by_recipe(
 ) -> Facts:
     # Imported here, as below: only this command needs torch and the simulation.
     from service.training.builtin import Amounts
-    from service.training.recipe import BUILTIN_PLAN, builtin_weights
+    from service.training.recipe import BUILTIN_PLANS, builtin_weights, shortened
 
     if recipe not in RECIPES or segmenter != "unet":
         raise UsageError(
@@ -111,9 +111,9 @@ def _by_recipe(
     amounts = Amounts()
     if scenes is not None:
         amounts = Amounts(train_scenes=scenes, validate_scenes=max(scenes // 10, 2))
-    plan = replace(BUILTIN_PLAN, **length.changes())
+    plans = shortened(BUILTIN_PLANS, length.steps, length.minutes)
     with progress_bars() as progress:
-        return builtin_weights(output, output / "unet.pt", plan, amounts, _shown(progress))
+        return builtin_weights(output, output / "unet.pt", plans, amounts, _shown(progress))
 
 
 def _on_labels(

@@ -28,7 +28,8 @@ class Plan:
     """What a training run does.
 
     It ends after `steps` batches or after `minutes`, whichever comes first; the learning rate
-    falls as a cosine over that span. look_every: steps between validations and checkpoints. data:
+    falls as a cosine over that span. centre_weight: of the middle line's part of the loss.
+    look_every: steps between validations and checkpoints. data:
     a digest of the labels and the weights a user began with, so that a run is not gone on with on
     others.
     """
@@ -43,6 +44,7 @@ class Plan:
     warm_up: int = 100
     average: float = 0.999
     gradient_norm: float = 5.0
+    centre_weight: float = 1.0
     look_every: int = 250
     channels: tuple[int, ...] = CHANNELS
     data: str = ""
@@ -136,7 +138,7 @@ def _advance(run: Run, pictures: StoredImages, *, fast: bool) -> None:
     with torch.autocast("cpu", torch.bfloat16, enabled=fast):
         output = run.network(normalised(batch.color_rgb))
     loss = loss_of(maps_of(output), torch.from_numpy(batch.maps))
-    total = loss.total()
+    total = loss.total(plan.centre_weight)
     run.optimiser.zero_grad(set_to_none=True)
     total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     torch.nn.utils.clip_grad_norm_(run.network.parameters(), plan.gradient_norm)
@@ -212,9 +214,9 @@ def resume(plan: Plan, folder: Path) -> Run | None:
             " (and go on from what this one holds with --init)"
         )
     for name in now.keys() - {"steps", "minutes", "look_every"}:
-        if then[name] != now[name]:
+        if then.get(name) != now[name]:
             raise UsageError(
-                f"{path}: was trained with {name} {then[name]}, not {now[name]};"
+                f"{path}: was trained with {name} {then.get(name)}, not {now[name]};"
                 " give another folder to start anew"
             )
     run = start(plan)

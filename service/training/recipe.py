@@ -5,6 +5,7 @@ import json
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,11 @@ from service.training.store import StoredImages
 WANTED_PRECISION = 0.88
 _CANDIDATES = 3
 UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
-BUILTIN_PLAN = Plan(steps=8400, look_every=300)
+BUILTIN_PLANS = (
+    Plan(steps=8400, look_every=300, centre_weight=0.5),
+    Plan(steps=7500, look_every=300, seed=2, peak_rate=1.5e-3),
+)
+"""One after the other: the second goes on from the averaged weights of the first."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -56,28 +61,59 @@ def halves_of(images: StoredImages) -> Halves:
 
 
 def builtin_weights(
-    folder: Path, output: Path, plan: Plan, amounts: builtin.Amounts, progress: Progress
+    folder: Path,
+    output: Path,
+    plans: Sequence[Plan],
+    amounts: builtin.Amounts,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Make the built-in weights in `folder`, going on where it was left; return what they are.
+
+    Each of the plans has a folder of its own, `run1` and so on.
 
     Raises:
         UsageError: a folder cannot be written, or holds a run of another plan.
     """
     builtin.draw(folder / "data", amounts, progress)
-    run = resume(plan, folder / "run") or start(plan)
     validate = StoredImages(folder / "data" / "validate")
     pictures = StoredImages(folder / "data" / "train")
     look = Look(validate, choosing(validate)[::4])
+    runs: list[Run] = []
+    for number, plan in enumerate(plans, start=1):
+        own = folder / f"run{number}"
+        init = runs[-1].averaged.state_dict() if runs else None
+        run = resume(plan, own) or start(plan, init)
+        runs.append(run)
 
-    def looked(network: UNet) -> dict[str, float]:
-        progress("steps", run.step, plan.steps)
-        return look(network)
+        def looked(network: UNet, run: Run = run) -> dict[str, float]:
+            before = sum(other.step for other in runs[:-1])
+            progress("steps", before + run.step, sum(plan.steps for plan in plans))
+            return look(network)
 
-    train(run, lambda: pictures, folder / "run", looked)
-    model, facts = finish(run, folder / "run", halves_of(validate))
-    facts["training"] |= {"pictures": len(pictures), "data": digest(pictures)}
+        train(run, lambda: pictures, own, looked)
+    model, facts = finish(runs[-1], folder / f"run{len(runs)}", halves_of(validate))
+    facts["training"] |= {
+        "plan": [run.plan.fields() for run in runs],
+        "steps": sum(run.step for run in runs),
+        "minutes": round(sum(run.seconds for run in runs) / 60, 1),
+        "pictures": len(pictures),
+        "data": digest(pictures),
+    }
     save(output, model, facts)
     return facts
+
+
+def shortened(plans: Sequence[Plan], steps: int | None, minutes: float | None) -> tuple[Plan, ...]:
+    """Return plans that together take so many steps, or so long; None: as they are."""
+    total = sum(plan.steps for plan in plans)
+    if steps is not None:
+        ends = [round(steps * done / total) for done in accumulate(plan.steps for plan in plans)]
+        lengths = [max(end - begin, 1) for begin, end in pairwise([0, *ends])]
+        plans = [replace(plan, steps=own) for plan, own in zip(plans, lengths, strict=True)]
+        total = sum(lengths)
+    if minutes is not None:
+        plans = [replace(plan, minutes=minutes * plan.steps / total) for plan in plans]
+    return tuple(plans)
 
 
 def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any]]:

@@ -148,17 +148,19 @@ def test_the_recipe_goes_from_nothing_to_weights_and_on_where_it_was(tmp_path, m
         seen.append((name, done, total))
 
     path = tmp_path / "unet.pt"
-    facts = builtin_weights(tmp_path, path, plan, amounts, progress)
+    plans = (plan, replace(plan, seed=2))
+    facts = builtin_weights(tmp_path, path, plans, amounts, progress)
     assert seen[:3] == [("validate", 1, 2), ("validate", 2, 2), ("train", 1, 1)]
-    assert facts["training"]["steps"] == 10
+    assert facts["training"]["steps"] == 20
     assert facts["training"]["pictures"] == 4
     assert facts["validation"]["reported"].keys() >= {"line_ap", "precision", "pixel_iou"}
     assert load(path).channels == plan.channels
-    log = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
-    again = builtin_weights(tmp_path, path, replace(plan, steps=15), amounts, progress)
-    assert again["training"]["steps"] == 15
+    log = (tmp_path / "run2" / "log.jsonl").read_text().splitlines()
+    longer = (plan, replace(plans[1], steps=15))
+    again = builtin_weights(tmp_path, path, longer, amounts, progress)
+    assert again["training"]["steps"] == 25
     assert again["training"]["data"] == facts["training"]["data"]
-    assert (tmp_path / "run" / "log.jsonl").read_text().splitlines()[: len(log)] == log
+    assert (tmp_path / "run2" / "log.jsonl").read_text().splitlines()[: len(log)] == log
 
 
 def test_calibrated_scores_are_the_share_that_is_wood():

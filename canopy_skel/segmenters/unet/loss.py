@@ -30,9 +30,9 @@ class Loss:
     direction: Tensor
     radius: Tensor
 
-    def total(self) -> Tensor:
+    def total(self, centre_weight: float) -> Tensor:
         """Return what is to be made small."""
-        return self.branch + 0.5 * self.centre + self.direction + 0.5 * self.radius
+        return self.branch + centre_weight * self.centre + self.direction + 0.5 * self.radius
 
 
 def loss_of(maps: Maps, targets: Tensor) -> Loss:
