@@ -10,12 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from canopy_skel.cluster import FARTHEST_M, require_range
-from canopy_skel.errors import ViewError
+from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
 from canopy_skel.kernels import profile
 from canopy_skel.segment import BranchMask
 from canopy_skel.spline import BranchSpline
+
+_MOST_KNOTS = 8
+"""As in `kernels.profile`, which must not be compiled for settings."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,8 +44,13 @@ class PieceConfig:
     centre_shift: float = np.pi / 4
 
     def __post_init__(self) -> None:
-        """Refuse a range of depth that is none."""
+        """Refuse a range of depth that is none, and knots for which kernels have no room."""
         require_range(self.nearest_m, self.farthest_m)
+        if not 2 <= self.fragment_knots <= _MOST_KNOTS or self.knot_px <= 0:
+            raise UsageError(
+                f"{self.fragment_knots} knots for a fragment, one every {self.knot_px} px: give"
+                f" 2 to {_MOST_KNOTS}, and a distance above 0"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

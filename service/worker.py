@@ -215,11 +215,12 @@ def main(arguments: Sequence[str]) -> NoReturn:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     stop = threading.Event()
-    _on_signals(lambda: _leave(0))  # nothing to close yet, and compiling kernels takes its time
+    _on_signals(sys.exit)  # compiling kernels takes its time, and its processes end with this one
     try:
         keys = Keys(site=options.site, rig=options.rig)
         keys.worker(options.id)
         compile_kernels((*METHODS, *SEGMENTERS))
+        _on_signals(lambda: _leave(0))  # nothing to close yet, and warming up takes its time
         with (
             open_session(connect=options.connect) as session,
             Worker(session, keys, options.id).running(),

@@ -124,7 +124,13 @@ def wood_log_odds(
     second: Floats32,
     second_bias: float,
 ) -> Floats32:
-    """Return the log odds (N,) of wood: one hidden layer (FIGURES, K) of what lies around."""
+    """Return the log odds (N,) of wood: one hidden layer (FIGURES, K) of what lies around.
+
+    Raises:
+        ValueError: the layer is of other figures.
+    """
+    if len(first) != FIGURES or first.shape[1] != len(first_bias) or len(second) != len(first_bias):
+        raise ValueError("the model of pixels is not of these figures: fit it again")
     found, row = np.zeros(len(v), dtype=np.float32), np.zeros(FIGURES, dtype=np.float32)
     ring, offsets = np.zeros((DIRECTIONS, 4), dtype=np.float32), ring_offsets(RINGS_PX)
     hidden = np.zeros(len(first_bias), dtype=np.float32)

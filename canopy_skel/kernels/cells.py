@@ -12,10 +12,20 @@ BOX = 7
 """Numbers that a box of cells takes: first and last in x, y and z, and how many rows it has."""
 
 
+_BITS, _BITS_Z = 18, 26
+"""A row of cells of 4 mm along z reaches as far from base as a camera may stand."""
+_LAST, _LAST_Z = (1 << _BITS) - 1, (1 << _BITS_Z) - 1
+
+
 @inner("int64(int64, int64, int64)")
 def cell_key(x: int, y: int, z: int) -> int:
-    """Return one number per cell; cells in a row along z follow one another."""
-    return ((x + 1048576) << 42) | ((y + 1048576) << 21) | (z + 1048576)
+    """Return one number per cell; cells in a row along z follow one another.
+
+    Across, numbers come again after 2^18 cells (1 km of 4 mm): cells near one another never share
+    one, wherever base is, so that no point is found twice.
+    """
+    across = ((x + (_LAST + 1) // 2) & _LAST) << _BITS | ((y + (_LAST + 1) // 2) & _LAST)
+    return across << _BITS_Z | ((z + (_LAST_Z + 1) // 2) & _LAST_Z)
 
 
 @inner("int64(int64[::1], int64)")

@@ -12,25 +12,43 @@ from typing import TypeVar
 
 from numba import njit
 
+from canopy_skel.errors import UsageError
+
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def kernel(signature: str, error_model: str = "python") -> Callable[[Function], Function]:
-    """Return the decorator for what Python calls."""
-    decorator: Callable[[Function], Function] = njit(  # type: ignore[call-overload]  # not in its stubs
-        signature, cache=True, nogil=True, error_model=error_model, no_cfunc_wrapper=True
-    )
-    return decorator
+    """Return the decorator for what Python calls.
+
+    Raises:
+        UsageError: (by the decorator) there is no folder to keep kernels in.
+    """
+    return _kept(signature, error_model=error_model)
 
 
 def inner(signature: str, error_model: str = "python") -> Callable[[Function], Function]:
-    """Return the decorator for what only kernels call."""
+    """Return the decorator for what only kernels call.
+
+    Raises:
+        UsageError: (by the decorator) there is no folder to keep kernels in.
+    """
+    return _kept(signature, error_model=error_model, no_cpython_wrapper=True)
+
+
+def _kept(signature: str, **options: str | bool) -> Callable[[Function], Function]:
     decorator: Callable[[Function], Function] = njit(  # type: ignore[call-overload]  # not in its stubs
-        signature,
-        cache=True,
-        nogil=True,
-        error_model=error_model,
-        no_cfunc_wrapper=True,
-        no_cpython_wrapper=True,
+        signature, cache=True, nogil=True, no_cfunc_wrapper=True, **options
     )
-    return decorator
+
+    def compiled(function: Function) -> Function:
+        try:
+            return decorator(function)
+        except RuntimeError as error:
+            if "cannot cache" not in str(error):
+                raise
+            raise UsageError(
+                "compiled kernels cannot be kept: neither the folder of the program nor the home"
+                " folder may be written; set NUMBA_CACHE_DIR to a folder that may"
+            ) from error
+
+    return compiled

@@ -13,10 +13,12 @@ from canopy_skel.confidence import (
     shipped_models,
 )
 from canopy_skel.document import Method, build_document, from_json, to_json
+from canopy_skel.errors import UsageError
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
 from canopy_skel.fusion import FusionConfig, Observations, fuse, turned
 from canopy_skel.geometry import transform_points
+from canopy_skel.kernels import profile
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
@@ -171,6 +173,13 @@ def test_other_methods_do_not_notice_the_settings_of_canopy():
 def test_settings_survive_being_taken_apart():
     config = CanopyConfig(rooted=True, fragments=FragmentConfig(min_px=12))
     assert canopy_config_from(asdict(config)) == config
+
+
+@pytest.mark.parametrize("wrong", [{"fragment_knots": n} for n in (-1, 1, 9)] + [{"knot_px": 0}])
+def test_pieces_of_more_knots_than_there_is_room_for_are_refused(wrong):
+    assert PieceConfig(fragment_knots=profile.MAX_KNOTS).fragment_knots == 8
+    with pytest.raises(UsageError, match="give 2 to 8"):
+        PieceConfig(**wrong)
 
 
 def test_pieces_run_along_the_axes_of_the_sticks():

@@ -134,6 +134,39 @@ def test_points_lie_off_the_nearest_vertex_that_runs_along_them():
     np.testing.assert_allclose(off, across, atol=1e-15)
 
 
+def all_found(points, directions, random):
+    """Return what every kernel that looks for neighbours finds, in the order of the points."""
+    order, keys = by_cell(points, CELL_M)
+    places, ways, place = points[order], directions[order], np.argsort(order)
+    radii, weights = random.uniform(0.002, 0.06, (2, len(points)))
+    fragment, kept = random.random(len(points)) < 0.5, np.zeros(len(points), np.bool_)
+    bits = np.ones(len(points), np.int64)
+    near = places, ways, *(one[order] for one in (radii, weights, weights, bits, fragment)), keys
+    shifted = kernel.shift_across(points, directions, radii, *near, CELL_M, WIDTH_M, 0.5, 0.5)
+    kept[order] = kernel.thinned(places, place, keys, CELL_M, 0.006)
+    return {
+        "support": shifted[2],
+        "spread": kernel.spread_around(
+            place, ways, places, weights[order], keys, CELL_M, WIDTH_M, 0.075
+        ),
+        "thinned": kept,
+        "agreed": agree.agreement(
+            points, directions, places, ways, fragment[order], keys, CELL_M, 0.012, 0.02, 0.82
+        ),
+        "along": aligning.offsets(points, directions, places, ways, keys, CELL_M, 0.9)[0],
+    }
+
+
+@pytest.mark.parametrize("away_m", [(0, 3e4, 0), (0, 0, -9e4), (-9e4, 9e4, 9e4), (1e5, -8e3, 1e5)])
+def test_neighbours_are_the_same_however_far_off_base_is(away_m):
+    points, directions, _ = twigs(23)
+    here = all_found(points, directions, np.random.default_rng(0))
+    there = all_found(points + away_m, directions, np.random.default_rng(0))
+    for name in here:
+        assert here[name].any()
+        np.testing.assert_allclose(there[name], here[name], rtol=1e-7, atol=1e-9, err_msg=name)
+
+
 def test_a_shift_and_a_turn_are_found_again():
     points, directions, random = twigs(17)
     shift, turn = random.normal(0, 0.01, (2, 3))

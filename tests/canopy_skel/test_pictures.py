@@ -9,8 +9,9 @@ from scipy.ndimage import gaussian_filter
 from canopy_skel import wood
 from canopy_skel.components import painted, pixels_of, runs_of
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, UNKNOWN, WOOD, evidence_of
-from canopy_skel.kernels import verdicts
+from canopy_skel.kernels import around, verdicts
 from canopy_skel.wood import FragmentConfig, fragments_of
+from canopy_skel.woodpixels import PixelModel
 
 SHAPES = [(40, 60), (41, 57), (1, 9), (9, 1)]
 
@@ -129,3 +130,15 @@ def test_colours_spread_as_if_all_of_them_were_worked_through(colours):
     counts = np.bincount(flat, minlength=1 << 17).reshape(32, 64, 64).astype(np.float64)
     expected = gaussian_filter(counts, 1.0, mode="nearest")
     np.testing.assert_array_equal(wood._histogram(flat), expected)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"first": (50, 3)}, {"first": (51, 2)}, {"first_bias": 4}, {"second": 2}]
+)
+def test_a_model_fitted_to_other_figures_is_refused(wrong):
+    shapes = {"first": (around.FIGURES, 3), "first_bias": 3, "second": 3}
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in (shapes | wrong).items()}
+    model = PixelModel(**arrays, second_bias=0.0, provenance="")
+    layers, one = np.zeros((4, 4, 4), np.float32), np.ones(1, np.int64)
+    with pytest.raises(ValueError, match="fit it again"):
+        model.probability(layers, np.zeros(1, np.float32), one, one)

@@ -2,15 +2,20 @@
 
 import importlib
 import os
+import signal
 import subprocess
 import sys
+import time
 from functools import cache
 from pathlib import Path
 
 import pytest
 
+from canopy_skel.errors import UsageError
 from canopy_skel.kernels import MODULES, NEEDED_BY
+from canopy_skel.kernels.compiled import kernel
 from canopy_skel.pipeline import METHODS
+from service.kernels import STAMP, compile_modules
 
 ROOT = Path(__file__).parents[2]
 SELDOM = {"centreline", "volume"}
@@ -116,7 +121,60 @@ def test_a_module_that_is_not_there_cannot_be_imported():
         from canopy_skel.kernels import pathfinding  # noqa: F401
 
 
-def test_installing_compiles_what_is_not_there_yet(tmp_path):
+def test_what_other_sources_gave_is_compiled_again(tmp_path):
+    """Numba does not see that a kernel called from another file has changed."""
+    one = "from service.kernels import compile_modules; compile_modules(['unions'])"
+    assert "compiling the kernels, once" in run(tmp_path, "-c", one)
+    before = compiled(tmp_path)
+    assert run(tmp_path, "-c", one) == ""
+    assert compiled(tmp_path) == before
+    (tmp_path / STAMP).write_text("of last year")
+    assert "compiling the kernels, once" in run(tmp_path, "-c", one)
+    after = compiled(tmp_path)
+    assert set(after) == set(before) == {"unions"}
+    assert not after["unions"] & before["unions"]
+
+
+def test_nothing_is_compiled_where_kernels_run_uncompiled(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    assert run(tmp_path, "-m", "service.kernels") == ""
+
+
+def test_without_a_folder_to_keep_kernels_in_the_mend_is_named():
+    space = {"__name__": "nowhere"}
+    exec(compile("def twice(n):\n    return 2 * n\n", "<nowhere>", "exec"), space)
+    with pytest.raises(UsageError, match="set NUMBA_CACHE_DIR"):
+        kernel("int64(int64)")(space["twice"])
+
+
+def test_a_folder_for_kernels_is_made(tmp_path):
+    start = "from service.kernels import compile_modules; compile_modules(['unions'])"
+    assert "compiling the kernels, once" in run(tmp_path / "not" / "there", "-c", start)
+    assert set(compiled(tmp_path)) == {"unions"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_worker_told_to_leave_while_it_compiles_takes_its_processes_along(number, tmp_path):
+    where = ["--connect", "tcp/127.0.0.1:1", "--site", "site", "--rig", "rig"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "service.worker", *where],
+        cwd=ROOT,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as worker:
+        assert worker.stderr.readline() == "compiling the kernels, once\n"
+        while not compiled(tmp_path):
+            time.sleep(0.1)
+        worker.send_signal(number)
+        # Ends when no process holds it any more.
+        assert worker.stderr.read() == ""
+    assert worker.returncode == 0
+
+
+def test_installing_compiles_what_is_not_there_yet(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compile_modules(())
     for name in MODULES - {"centreline"}:
         (tmp_path / f"{name}.any-1.py311.nbi").touch()
     before = set(compiled(tmp_path))
