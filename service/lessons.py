@@ -21,8 +21,12 @@ from service.experiment.segmenters import segmenter_named
 from service.pixellessons import pixel_model_of
 
 
-def pixel_models_without(paths: Sequence[Path]) -> dict[Path, PixelModel | None]:
+def pixel_models_without(
+    paths: Sequence[Path], more: Sequence[Path] = ()
+) -> dict[Path, PixelModel | None]:
     """Return for each recording a model of wood pixels that was fitted to other trees.
+
+    Those of the recordings, and of `more`.
 
     A model knows the trees it was fitted to better than others, and confidences learned there would
     promise too much. Trees, by name without the foliage, are dealt out in two halves; where one is
@@ -31,12 +35,13 @@ def pixel_models_without(paths: Sequence[Path]) -> dict[Path, PixelModel | None]
     Raises:
         RecordingError: one cannot be read, or has no truth.
     """
-    trees = sorted({_tree(path) for path in paths})
-    halves = [[path for path in paths if trees.index(_tree(path)) % 2 == k] for k in (0, 1)]
+    every = sorted({*paths, *more})
+    trees = sorted({_tree(path) for path in every})
+    halves = [[path for path in every if trees.index(_tree(path)) % 2 == k] for k in (0, 1)]
     if not all(halves):
         return dict.fromkeys(paths)
     models = [pixel_model_of(half, ("recorded",)) for half in halves]
-    return {path: models[1 - k] for k in (0, 1) for path in halves[k]}
+    return {path: models[1 - trees.index(_tree(path)) % 2] for path in paths}
 
 
 def _tree(path: Path) -> str:

@@ -22,6 +22,10 @@ def fit_confidence(
         list[Path] | None,
         typer.Option(help="Recordings to test on, not fitted; repeatable."),
     ] = None,
+    pixels: Annotated[
+        list[Path] | None,
+        typer.Option(help="More recordings to learn wood pixels from meanwhile; repeatable."),
+    ] = None,
     segmenter: Annotated[
         list[str] | None,
         typer.Option(
@@ -45,7 +49,7 @@ def fit_confidence(
         raise UsageError(f"{output} is a folder; name the JSON file to write")
     masks = ("recorded", *(segmenter or WORSE_MASKS))
     compile_kernels(["canopy", *masks])
-    pixel_models = pixel_models_without(recordings)
+    pixel_models = pixel_models_without(recordings, pixels or ())
     lessons = []
     with progress_bars() as progress:
         task = progress.add_task("scans", total=len(recordings))
