@@ -46,7 +46,8 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python benchmarks/stages.py --output docs/results --keep out/bench
+	$(BIN)/python benchmarks/stages.py alone --output docs/results --page bench-process.md --keep out/bench
+	$(BIN)/python benchmarks/stages.py stages updates scaling replay --output docs/results --keep out/bench
 
 bench-scan: $(RUNS)
 	$(BIN)/python benchmarks/waypoints.py
