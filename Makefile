@@ -8,7 +8,7 @@ VALIDATOR := $(VENV)/gltf_validator
 RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
 
-.PHONY: setup demo demo-replay test check bench bench-scan results departures figures maskrcnn
+.PHONY: setup demo demo-replay test check kernels bench bench-scan results departures figures maskrcnn
 
 setup: $(READY)
 
@@ -45,17 +45,21 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(READY)
+# Anew where their sources have changed: by itself Numba looks at one file at a time.
+kernels: $(READY)
+	$(BIN)/python -m service.kernels
+
+bench: kernels
 	$(BIN)/python benchmarks/stages.py alone --output docs/results --page bench-process.md --keep out/bench
 	$(BIN)/python benchmarks/stages.py stages updates scaling replay --output docs/results --keep out/bench
 
 bench-scan: $(RUNS)
 	$(BIN)/python benchmarks/waypoints.py
 
-results: $(READY)
+results: kernels
 	$(BIN)/python benchmarks/recordings.py ../shared/data/recordings --output docs/results.md
 
-departures: $(READY)
+departures: kernels
 	$(BIN)/python benchmarks/departures.py ../shared/data/recordings --output docs/departures.md
 
 # The figures of docs/method.md; the ones in the repository are of a longer recording.

@@ -4,7 +4,13 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from canopy_skel.kernels import MODULES
+from service.kernels import compile_modules
+
 sys.path.insert(0, str(Path(__file__).parent))
+
+# Numba alone would go on with kernels whose callees have changed since.
+compile_modules(MODULES)
 
 # Kernels are compiled on first use, so single examples may be slow once.
 settings.register_profile(
