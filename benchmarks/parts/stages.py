@@ -32,7 +32,7 @@ def report(quick, _output, kept):
         text, rows = kept(name, lambda mm=voxel_mm, n=views: at_voxel_size(mm / 1000, n))
         texts.append(text)
         for name, slow, fast, *_ in rows:
-            if slow:
+            if not isinstance(slow, str):
                 facts[name.split(",")[0], voxel_mm] = slow / fast
     return "\n".join(texts), facts
 
@@ -54,25 +54,37 @@ def at_voxel_size(voxel_m, views):
     return table(title, HEAD, rows) + f"\nMap and search hold {held_mb:.0f} MB.\n", rows
 
 
-def row(name, slow, fast, floor=None, what=None):
-    return (name, slow, fast, f"{slow / fast:.1f} x" if slow else None, floor, what)
+def row(name, slow, fast, floor, what):
+    """Return a line of the table; slow: milliseconds, or why it was not run."""
+    return (
+        name,
+        slow,
+        fast,
+        None if isinstance(slow, str) else f"{slow / fast:.1f} x",
+        floor,
+        what,
+    )
 
 
 def least_squares(clusters):
     points = np.concatenate([c.points_in_base for c in clusters])
-    floor = least_ms(lambda: [points.sum(axis=0) for _ in range(3)])
     return row(
         f"least squares, {len(clusters)} clusters",
         least_ms(lambda: obvious.splines(clusters)),
         least_ms(lambda: fit_splines(clusters, CONFIG.spline), 5),
-        floor,
-        "three sums over all points",
+        *summed(points),
     )
 
 
+def summed(points):
+    """Return what three sums over points (N, 3) take, and what that is."""
+    columns = np.ascontiguousarray(points.T)
+    return least_ms(lambda: [columns.sum(axis=1) for _ in range(3)]), "three sums over all points"
+
+
 def map_update(segments, voxel_m):
-    slow = None
-    if voxel_m > 0.004:  # or the dense array would be 7 GB
+    slow = "its array would be 7 GB"
+    if voxel_m > 0.004:
         dense = obvious.DenseMap((-0.5,) * 3, (2.5,) * 3, voxel_m)
         slow = np.median([least_ms(lambda one=one: dense.add(one), 2) for one in segments])
         dense = None
@@ -82,13 +94,15 @@ def map_update(segments, voxel_m):
         engine.map.add(one)  # blocks are allocated: as in the middle of a scan
         fast.append(least_ms(lambda engine=engine, one=one: engine.map.add(one), 5))
         support.append(support_of(one, voxel_m))
-    sums = np.zeros(int(np.median(support)), dtype=np.int32)
+    return row("map update, one view", slow, np.median(fast), *touched(int(np.median(support))))
 
-    def touch():
-        sums.__iadd__(1)
 
-    what = f"one addition to each of {len(sums)} voxels in a row"
-    return row("map update, one view", slow, np.median(fast), least_ms(touch, 5), what)
+def touched(voxels):
+    """Return what adding to so many voxels in a row takes, and what that is."""
+    sums = np.zeros(voxels, dtype=np.int32)
+    return least_ms(
+        lambda: sums.__iadd__(1), 5
+    ), f"one addition to each of {voxels} voxels in a row"
 
 
 def support_of(segments, voxel_m):
@@ -109,7 +123,8 @@ def skeleton_stages(engine, segments, voxel_m):
 
     strands = [fresh() for _ in range(2)]
     moved, slow = timed(lambda: obvious.smoothed(points))
-    rows = [row("smoothing, 3 steps", slow, min(timed(s.smoothed)[1] for s in strands))]
+    ours_ms = min(timed(s.smoothed)[1] for s in strands)
+    rows = [row("smoothing, 3 steps", slow, ours_ms, *summed(points))]
     smoothed = engine.strands.smoothed()
 
     def ours():
@@ -117,14 +132,17 @@ def skeleton_stages(engine, segments, voxel_m):
         spanning_forest(vertices, voxel_m)
 
     slow = timed(lambda: obvious.forest(moved, voxel_m))[1]
-    rows.append(row("consolidation and forest", slow, least_ms(ours)))
+    keys = voxels_of(smoothed.points_in_base, voxel_m)[:, 0]
+    floor = least_ms(lambda: np.sort(keys))
+    what = "one sort of as many integers as there are points"
+    rows.append(row("consolidation and forest", slow, least_ms(ours), floor, what))
     return rows
 
 
 def scipy_search(engine, initial):
     """Return what building the explicit graph and one Dijkstra on it take."""
-    if engine.map.voxel_size_m < 0.004:
-        return None, None  # 60 million edges: more memory than a robot's computer has
+    if engine.map.voxel_size_m < 0.004:  # more memory than a robot's computer has
+        return None, "its graph would have 60 million edges"
     grid = engine.map.grid()
     index = VoxelIndex(grid.voxels)
     graph, build = timed(
@@ -145,12 +163,18 @@ def search_stages(engine):
 
     (search, joins), ours = min((timed(scratch) for _ in range(2)), key=lambda r: r[1])
     engine.search = search
-    if single is None:
-        return [("Algorithm 1", None, ours, None, None, None)]
+    if isinstance(single, str):
+        return [row("Algorithm 1", single, ours, *touched(engine.map.occupied()))]
     pieces = initial.components()[0]
     runs = sum(range(pieces - len(joins), pieces + 1))
     cheapest = f"one such Dijkstra, graph not counted ({build:.0f} ms)"
     return [
         row("Algorithm 1 / one scipy Dijkstra", single, ours, single, cheapest),
-        row(f"Algorithm 1 / literal, {runs} Dijkstras (extrapolated)", runs * single, ours),
+        row(
+            f"Algorithm 1 / literal, {runs} Dijkstras (extrapolated)",
+            runs * single,
+            ours,
+            single,
+            cheapest,
+        ),
     ]
