@@ -9,7 +9,7 @@ bench-scaling.png. Times are CPU time of the thread, the least of some runs or t
 views: the machine's speed cancels out of the ratios, other jobs nearly do. What `alone` times by
 the clock wants an idle machine, so `make bench` gives it a page of its own. With --keep, what was
 measured in an earlier run is taken from that folder: an interrupted run goes on; empty the folder
-to measure anew.
+to measure anew. The obvious way takes 5 GB at 2.5 mm.
 """
 
 import argparse

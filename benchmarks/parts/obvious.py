@@ -3,10 +3,30 @@
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from canopy_skel.cluster import principal_axes
+
+
+def clusters(view, masks, within_m=0.01, neighbours=20):
+    """Outliers off by their neighbours' distances, then what lies within 1 cm, mask by mask."""
+    found = []
+    for mask in masks:
+        v, u = np.nonzero(mask.mask)
+        v, u = v + mask.top_px, u + mask.left_px
+        points = view.intrinsics.back_project(
+            *(a.astype(float) for a in (u, v, view.depth_m[v, u]))
+        )
+        away = cKDTree(points).query(points, k=neighbours)[0].mean(axis=1)
+        points = points[away <= away.mean() + away.std()]
+        pairs = cKDTree(points).query_pairs(within_m, output_type="ndarray")
+        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+        count, part = connected_components(links, directed=False)
+        found += [points[part == k] for k in range(count)]
+        for one in found[-count:]:
+            principal_axes(one)  # is it slender?
+    return found
 
 
 def splines(clusters):
@@ -27,7 +47,7 @@ class DenseMap:
         self.voxel_size_m = voxel_size_m
         self.origin = np.floor(np.asarray(low_m) / voxel_size_m).astype(int)
         shape = np.ceil(np.asarray(high_m) / voxel_size_m).astype(int) - self.origin
-        self.q = np.ones(shape, dtype=np.float32)
+        self.p = np.zeros(shape, dtype=np.float32)  # takes memory where it is written only
 
     def add(self, segments, k=3.0):
         voxel = self.voxel_size_m
@@ -38,7 +58,7 @@ class DenseMap:
         low = np.floor(tips.min(axis=0) - k * radii[:, None]).astype(int)
         high = np.ceil(tips.max(axis=0) + k * radii[:, None]).astype(int) + 1
         low = np.maximum(low, self.origin)
-        high = np.minimum(high, self.origin + self.q.shape)
+        high = np.minimum(high, self.origin + self.p.shape)
         for i in range(len(starts)):
             if (low[i] >= high[i]).any():
                 continue
@@ -50,7 +70,8 @@ class DenseMap:
             s = np.sqrt((outside / length[i]) ** 2 + (across / radii[i]) ** 2)
             p = np.maximum(segments.confidence[i] * (1 - s / k), 0.0)
             corners = zip(low[i] - self.origin, high[i] - self.origin, strict=True)
-            self.q[tuple(slice(a, b) for a, b in corners)] *= 1 - p
+            box = self.p[tuple(slice(a, b) for a, b in corners)]
+            box += p * (1 - box)
 
 
 def smoothed(points, steps=3):
