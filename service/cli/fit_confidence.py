@@ -1,13 +1,17 @@
 """`canopy fit-confidence`."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from canopy_skel.errors import UsageError
 from service.cli.shell import progress_bars, stderr
 from service.kernels import compile_kernels
+
+if TYPE_CHECKING:
+    from canopy_skel.confidence import ModelSets
 
 WORSE_MASKS = ("drop25+false20", "unet")
 """What the shipped confidences of learned masks are fitted to, beside recorded ones."""
@@ -42,8 +46,7 @@ def fit_confidence(
     """
     # Imported here: only this command fits.
     from canopy_skel.confidence import models_to
-    from canopy_skel.fitting import reliability
-    from service.lessons import fitted, lesson_from, lessons_from, pixel_models_without
+    from service.lessons import fitted, lessons_from, pixel_models_without
 
     if output.is_dir():
         raise UsageError(f"{output} is a folder; name the JSON file to write")
@@ -61,7 +64,14 @@ def fit_confidence(
     for kind, by_depth in models.items():
         for depth, one in by_depth.items():
             stderr.print(f"{output}, {kind}, {depth}: {one.provenance}", markup=False)
-    for path in held_out or []:
+    _show_held_out(held_out or (), masks, models)
+
+
+def _show_held_out(paths: Sequence[Path], masks: Sequence[str], models: "ModelSets") -> None:
+    from canopy_skel.fitting import reliability
+    from service.lessons import lesson_from
+
+    for path in paths:
         for name in masks:
             lesson = lesson_from(path, name)
             chosen = models["recorded" if name == "recorded" else "learned"][lesson.depth]

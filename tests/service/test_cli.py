@@ -76,6 +76,8 @@ def test_confidences_are_learned_beside_wood_pixels_of_other_trees(tmp_path):
         "apple_1_fd1, apple_1_fd2",
     ]
     assert pixel_models_without(paths[:2]) == dict.fromkeys(paths[:2])
+    more = pixel_models_without(paths[2:], paths[:2])
+    assert [model.provenance for model in more.values()] == [beside[paths[2]].provenance]
 
 
 def test_each_kind_of_depth_has_confidences_from_its_own_scans(tmp_path):
