@@ -1,19 +1,62 @@
+"""Numba compiles what it understands; Python runs what is written: both must do the same."""
+
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-HERE = Path(__file__).parent
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SMALL = (
+    "test_kernels.py",
+    "test_neighbours.py",
+    "test_pictures.py",
+    "test_volume.py::test_wood_drawn_twice_counts_once",
+    "test_spline.py::test_radius_is_the_papers_half_extent_along_pc2",
+    "segmenters/test_labels.py::test_targets_say_where_branches_are_how_they_run_and_how_thick",
+    "segmenters/test_grouping.py::test_branches_that_touch_side_by_side_are_two",
+    "segmenters/test_grouping.py::test_at_a_fork_the_straightest_way_goes_on",
+)
+CANOPY = """
+import json, sys
+sys.path.insert(0, "tests")
+from scenes.leaves import leafy_view
+from canopy_skel.pipeline import MethodConfig, Skeletonizer
+from canopy_skel.segmenters.recorded import RecordedSegmenter
+maker = Skeletonizer(RecordedSegmenter(), MethodConfig(name="canopy"))
+for index in range(2):
+    maker.add_view(leafy_view(index, y=0.1 * index))
+graph = maker.skeleton().graph
+print(json.dumps([graph.vertices_in_base.tolist(), graph.edges.tolist()]))
+"""
 
 
-def test_kernels_do_the_same_uncompiled():
-    """Numba compiles what it understands; Python runs what is written."""
-    run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-x", str(HERE / "test_kernels.py")],
-        cwd=HERE.parents[1],
+def uncompiled(*arguments):
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=ROOT,
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert run.returncode == 0, run.stdout + run.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_kernels_do_the_same_uncompiled():
+    tests = [f"tests/canopy_skel/{name}" for name in SMALL]
+    assert "[100%]" in uncompiled("-m", "pytest", "-q", "-x", *tests)
+
+
+def test_method_canopy_gives_the_same_skeleton_uncompiled():
+    compiled = subprocess.run(
+        [sys.executable, "-c", CANOPY], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    (expected, edges), (vertices, found) = map(json.loads, (compiled, uncompiled("-c", CANOPY)))
+    assert len(edges) > 50
+    assert found == edges
+    assert np.array(vertices) == pytest.approx(np.array(expected), abs=1e-6)
