@@ -93,16 +93,14 @@ class CanopyScan:
         self._agreed: dict[int, IntArray] = {}
 
     def observe(
-        self, view: View, masks: Sequence[BranchMask], probability: Float32Array | None = None
+        self, view: View, masks: Sequence[BranchMask], maps: Float32Array | None = None
     ) -> Observation:
         """Return what a view shows; nothing changes.
 
-        `probability` (H, W): of wood, where a detector gives it; without, colour has to do.
+        maps: (5, h, w) of the network; without, no wood is looked for beside the masks.
         """
         fragments = self.config.fragments if self.config.use_fragments else None
-        return observe(
-            view, list(masks), self.config.pieces, fragments, probability, self._pixel_model
-        )
+        return observe(view, list(masks), self.config.pieces, fragments, maps, self._pixel_model)
 
     def add(self, index: int, seen: Observation) -> None:
         """Take a view in: all points are asked in it, and its points in all views."""

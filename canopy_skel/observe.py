@@ -20,7 +20,6 @@ from canopy_skel.segment import BranchMask
 from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import (
     FragmentConfig,
-    at_tree,
     fragments_of,
     mask_image,
     wood_probability,
@@ -81,13 +80,13 @@ def observe(
     masks: list[BranchMask],
     pieces_config: PieceConfig,
     fragments_config: FragmentConfig | None,
-    probability: Float32Array | None = None,
+    maps: Float32Array | None = None,
     pixel_model: PixelModel | None = None,
 ) -> Observation:
     """Lift the masks of a view, and the fragments beside them, into base.
 
-    `probability` (H, W): of wood, from a detector; None: by colour and `pixel_model`, without one
-    that which is shipped. `fragments_config` None: no fragments.
+    maps: (5, h, w) of the network, which fragments need. pixel_model: without, the shipped one.
+    `fragments_config` or `maps` None: no fragments.
 
     Raises:
         ViewError: the view has no depth.
@@ -98,16 +97,10 @@ def observe(
     wood = mask_image(view, regions)
     with np.errstate(invalid="ignore"):  # Wood of other rows says nothing of this tree's.
         wood &= ~(depth_of(view) > pieces_config.farthest_m)
-    if fragments_config is not None:
-        if probability is None:
-            limit = fragments_config.min_probability
-            model = pixel_model or shipped_pixel_model()
-            probability = wood_probability(view, wood, fragments_config, model)
-        else:
-            limit = fragments_config.min_detected
-            outside = at_tree(view, wood, fragments_config) & ~wood
-            probability = np.where(outside, probability, np.float32(0))
-        fragments = fragments_of(probability, limit, fragments_config)
+    if fragments_config is not None and maps is not None:
+        model = pixel_model or shipped_pixel_model()
+        probability = wood_probability(view, maps, wood, fragments_config, model)
+        fragments = fragments_of(probability, fragments_config)
         pieces += pieces_of(view, fragments, pieces_config, fragments=True)
         wood[fragments.v, fragments.u] = True
     points, directions, of = sampled(pieces)

@@ -1,7 +1,7 @@
 """Views in, one growing likelihood map, a skeleton out: the whole method in the paper's order."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -23,11 +23,11 @@ from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.poses import PoseCorrection
-from canopy_skel.segment import BranchMask, Segmenter
+from canopy_skel.segment import Segmenter
+from canopy_skel.segmenters.mapping import WithMaps
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_splines
 from canopy_skel.strands import StrandMap
-from canopy_skel.wood import wood_of
 
 MethodName = Literal["canopy", "paper", "mst", "ftsem"]
 METHODS: tuple[MethodName, ...] = get_args(MethodName)
@@ -126,6 +126,7 @@ class Skeletonizer:
         `canopy`: without, `models_for` the segmenter.
         """
         self._segmenter = segmenter
+        self._with_maps = WithMaps(segmenter)
         self._config = config
         self._stage = stage
         self._memory_limit_bytes = memory_limit_bytes
@@ -174,10 +175,10 @@ class Skeletonizer:
         if view.index in self._known:
             return self._known[view.index].shown
         self._check_place(view)
+        if self._config.name == "canopy":
+            return self._observe(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
-        if self._config.name == "canopy":
-            return self._observe(view, masks)
         with self._stage("cluster"):
             clusters, rejected = cluster_branches(view, masks, self._config.cluster)
         with self._stage("spline"):
@@ -194,9 +195,15 @@ class Skeletonizer:
         )
         return len(splines)
 
-    def _observe(self, view: View, masks: Sequence[BranchMask]) -> int:
+    def _observe(self, view: View) -> int:
+        maps = None
+        with self._stage("segment"):
+            if self._config.canopy.use_fragments:
+                masks, maps = self._with_maps.segment_and_map(view)
+            else:
+                masks = self._segmenter.segment(view)
         with self._stage("observe"):
-            seen = self._canopy.observe(view, masks, wood_of(self._segmenter, view))
+            seen = self._canopy.observe(view, masks, maps)
         with self._stage("likelihood"):
             self._add(seen.splines)
         with self._stage("evidence"):

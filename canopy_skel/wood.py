@@ -1,7 +1,6 @@
 """Wood outside the instance masks: what is too small or too thin for a mask of its own."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from canopy_skel.components import pixels_of, runs_of
 from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import BoolArray, IntArray
 from canopy_skel.pieces import Regions, depth_of
-from canopy_skel.woodpixels import PixelModel, lab_of, layers_of
+from canopy_skel.woodpixels import PixelModel, hints_of, lab_of, layers_of
 
 _SPREAD = 4
 """Colours count up to so many bins from their own."""
@@ -21,35 +20,21 @@ _SPREAD = 4
 class FragmentConfig:
     """What counts as a fragment.
 
-    Pixels outside the masks with a wood probability of at least `min_probability` (`min_detected`
-    where a detector gives it), connected, at least `min_px`. Pixels whose colour has log odds under
-    `min_log_odds` are not asked. They count within `margin_m` of the depths the masks span, so that
-    rows behind stay out. Colours are told apart in Lab bins after smoothing; `shrink_px` pixels of
-    nothing-known are added to each, so that a colour seldom seen says little.
+    Pixels outside the masks with a wood probability of at least `min_probability`, connected, at
+    least `min_px`. Pixels are not asked whose colour has log odds under `min_log_odds`, unless the
+    network gives them a logit of `min_logit`. They count within `margin_m` of the depths the masks
+    span, so that rows behind stay out. Colours are told apart in Lab bins after smoothing;
+    `shrink_px` pixels of nothing-known are added to each, so that a colour seldom seen says little.
     """
 
     min_probability: float = 0.3
-    min_detected: float = 0.6
     min_log_odds: float = -1.0
+    min_logit: float = 0.0
     blur_px: int = 3
     min_px: int = 10
     max_px: int = 4000
     margin_m: float = 0.3
     shrink_px: float = 2.0
-
-
-@runtime_checkable
-class WoodDetector(Protocol):
-    """A segmenter that also says for every pixel how likely it is wood."""
-
-    def wood_probability(self, view: View) -> Float32Array:
-        """Return (H, W) probabilities of wood, at even odds between wood and all else."""
-        ...
-
-
-def wood_of(segmenter: object, view: View) -> Float32Array | None:
-    """Return the wood probability (H, W) of a segmenter that has one, else None."""
-    return segmenter.wood_probability(view) if isinstance(segmenter, WoodDetector) else None
 
 
 def mask_image(view: View, regions: Regions) -> BoolArray:
@@ -60,27 +45,37 @@ def mask_image(view: View, regions: Regions) -> BoolArray:
 
 
 def wood_probability(
-    view: View, covered: BoolArray, config: FragmentConfig, model: PixelModel
+    view: View,
+    maps: Float32Array,
+    covered: BoolArray,
+    config: FragmentConfig,
+    model: PixelModel,
 ) -> Float32Array:
     """Return (H, W) wood probabilities of pixels outside the masks, 0 where nothing is asked.
 
-    Colour, learned from the view's own masks, says which pixels to ask; the model looks at what
-    lies around them. One view alone, so that no other view changes its fragments.
+    Colour, learned from the view's own masks, and the maps (5, h, w) of a network say which pixels
+    to ask; the model looks at what lies around them too. One view alone, so that no other view
+    changes its fragments.
     """
     probability = np.zeros(covered.shape, dtype=np.float32)
     lab = lab_of(view)
     log_odds, mean_odds = colour_log_odds(view, lab, covered, config)
-    v, u = asked_pixels(mean_odds, config)
+    v, u = asked_pixels(mean_odds, maps, config)
     if len(v) == 0:
         return probability
     layers = layers_of(view, lab, covered, log_odds)
-    probability[v, u] = model.probability(layers, mean_odds[v, u], v, u)
+    probability[v, u] = model.probability(layers, hints_of(maps), mean_odds[v, u], v, u)
     return probability
 
 
-def asked_pixels(mean_odds: Float32Array, config: FragmentConfig) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the pixels whose colour may be that of wood."""
-    v, u = np.divmod(np.flatnonzero(mean_odds >= config.min_log_odds), mean_odds.shape[1])
+def asked_pixels(
+    mean_odds: Float32Array, maps: Float32Array, config: FragmentConfig
+) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the pixels that by colour or network may be wood."""
+    height, width = mean_odds.shape
+    logit = cv2.resize(maps[0], (width, height), interpolation=cv2.INTER_LINEAR)
+    asked = (mean_odds >= config.min_log_odds) | (logit >= config.min_logit)
+    v, u = np.divmod(np.flatnonzero(asked & (mean_odds > -np.inf)), width)
     return v, u
 
 
@@ -126,11 +121,9 @@ def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray
         return np.asarray((depth_m >= low - config.margin_m) & (depth_m <= high + config.margin_m))
 
 
-def fragments_of(
-    probability: Float32Array, min_probability: float, config: FragmentConfig
-) -> Regions:
+def fragments_of(probability: Float32Array, config: FragmentConfig) -> Regions:
     """Return the connected components of probable wood, in raster order of blocks of pixels."""
-    runs = runs_of(probability >= min_probability)
+    runs = runs_of(probability >= config.min_probability)
     kept = np.flatnonzero((runs.area >= config.min_px) & (runs.area <= config.max_px))
     # By the first block of 2 x 2 pixels that any pixel is in; within a component by row.
     block = (runs.row // 2) * probability.shape[1] + runs.first_px // 2

@@ -18,6 +18,8 @@ from canopy_skel.pieces import depth_of
 PIXEL_MODEL_FILE = "wood-pixels.json"
 _MOST_ODDS = 4.0
 _BLUR_PX = 0.7
+_MOST_LOGIT = 8.0
+_NEAR_CELLS, _AROUND_CELLS = 5, 3.75
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -34,11 +36,17 @@ class PixelModel:
     provenance: str
 
     def probability(
-        self, layers: Float32Array, mean_odds: Float32Array, v: IntArray, u: IntArray
+        self,
+        layers: Float32Array,
+        hints: Float32Array,
+        mean_odds: Float32Array,
+        v: IntArray,
+        u: IntArray,
     ) -> Float32Array:
-        """Return the probabilities (N,) of pixels (v, u); `layers` as `layers_of` makes them."""
+        """Return the probabilities (N,) of pixels (v, u), of `layers_of` and `hints_of`."""
         odds = around.wood_log_odds(
             layers,
+            hints,
             mean_odds,
             v,
             u,
@@ -68,11 +76,23 @@ def layers_of(
     return np.asarray(cv2.merge([*layers, depth_m, covered.astype(np.float32)]), dtype=np.float32)
 
 
+def hints_of(maps: Float32Array) -> Float32Array:
+    """Return what the model takes from a network's maps (5, h, w): (h, w, HINTS).
+
+    The logits of branch and middle line, the logarithm of the radius, and around each cell the
+    highest logit of branch and their mean.
+    """
+    branch, centre = np.clip(maps[:2], -_MOST_LOGIT, _MOST_LOGIT)
+    near = cv2.dilate(branch, np.ones((_NEAR_CELLS, _NEAR_CELLS), np.uint8))
+    around_it = cv2.GaussianBlur(branch, (0, 0), _AROUND_CELLS)
+    return np.asarray(cv2.merge([branch, centre, maps[4], near, around_it]), dtype=np.float32)
+
+
 def figures_of(
-    layers: Float32Array, mean_odds: Float32Array, v: IntArray, u: IntArray
+    layers: Float32Array, hints: Float32Array, mean_odds: Float32Array, v: IntArray, u: IntArray
 ) -> Float32Array:
     """Return what the model is told of pixels (v, u): (N, FIGURES)."""
-    return around.figures_around(layers, mean_odds, v, u)
+    return around.figures_around(layers, hints, mean_odds, v, u)
 
 
 def pixel_model_from(value: Mapping[str, Any]) -> PixelModel:

@@ -14,7 +14,7 @@ from canopy_skel.frame import View
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
-from canopy_skel.wood import wood_of
+from canopy_skel.segmenters.mapping import WithMaps
 from canopy_skel.woodpixels import PixelModel
 from drivers.stereo import with_depth
 from service.experiment.segmenters import segmenter_named
@@ -95,11 +95,11 @@ def _lesson(
     use_fragments: bool,
     pixel_model: PixelModel | None,
 ) -> Lesson:
-    finder = segmenter_named(segmenter)
+    finder = WithMaps(segmenter_named(segmenter))
     scan = CanopyScan(CanopyConfig(use_fragments=use_fragments), pixel_model)
     likelihood = LikelihoodMap(LikelihoodConfig())
     for view in views:
-        seen = scan.observe(view, finder.segment(view), wood_of(finder, view))
+        seen = scan.observe(view, *finder.segment_and_map(view))
         likelihood.add(segments_of(seen.splines))
         scan.add(view.index, seen)
     depth: Depth = "stereo" if any(view.matched for view in views) else "camera"

@@ -14,9 +14,9 @@ from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, transform_points
 from canopy_skel.pieces import depth_of, regions_of_masks
 from canopy_skel.recording import read_recording
-from canopy_skel.segment import Segmenter
+from canopy_skel.segmenters.mapping import WithMaps
 from canopy_skel.wood import asked_pixels, colour_log_odds, mask_image
-from canopy_skel.woodpixels import PixelModel, figures_of, lab_of, layers_of
+from canopy_skel.woodpixels import PixelModel, figures_of, hints_of, lab_of, layers_of
 from service.experiment.segmenters import segmenter_named
 from service.pixelfit import fit_pixels
 
@@ -58,7 +58,7 @@ def pixel_model_of(paths: Sequence[Path], masks: Sequence[str]) -> PixelModel | 
 
 
 def _of(path: Path, masks: str) -> list[Pixels]:
-    finder = segmenter_named(masks)
+    finder = WithMaps(segmenter_named(masks))
     recording = read_recording(path)
     if recording.ground_truth is None:
         raise RecordingError(
@@ -80,14 +80,15 @@ def _truth(truth: SkeletonDocument) -> tuple[cKDTree, FloatArray]:
     return cKDTree(points.reshape(-1, 3)), radius_m.ravel()
 
 
-def _pixels(view: View, finder: Segmenter, tree: cKDTree, radius_m: FloatArray) -> Pixels:
+def _pixels(view: View, finder: WithMaps, tree: cKDTree, radius_m: FloatArray) -> Pixels:
     settings = CanopyConfig()
     depth_m = depth_of(view)
-    covered = mask_image(view, regions_of_masks(finder.segment(view)))
+    masks, maps = finder.segment_and_map(view)
+    covered = mask_image(view, regions_of_masks(masks))
     covered &= ~(depth_m > settings.pieces.farthest_m)
     lab = lab_of(view)
     log_odds, mean_odds = colour_log_odds(view, lab, covered, settings.fragments)
-    v, u = asked_pixels(mean_odds, settings.fragments)
+    v, u = asked_pixels(mean_odds, maps, settings.fragments)
     surface = view.intrinsics.back_project(
         u.astype(np.float64), v.astype(np.float64), depth_m[v, u].astype(np.float64)
     )
@@ -96,8 +97,9 @@ def _pixels(view: View, finder: Segmenter, tree: cKDTree, radius_m: FloatArray) 
     shares = np.where(wood, _WOOD_SHARE, _OTHER_SHARE)
     drawn = np.random.default_rng(view.index).random(len(v)) < shares
     v, u, wood, shares = v[drawn], u[drawn], wood[drawn], shares[drawn]
+    layers, hints = layers_of(view, lab, covered, log_odds), hints_of(maps)
     return Pixels(
-        figures=figures_of(layers_of(view, lab, covered, log_odds), mean_odds[v, u], v, u),
+        figures=figures_of(layers, hints, mean_odds[v, u], v, u),
         wood=wood,
         weights=(1.0 / shares).astype(np.float32),
     )

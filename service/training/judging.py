@@ -64,14 +64,14 @@ def rescored(sightings: Sequence[Sighting], calibration: Calibration) -> list[Si
 
 
 def calibrated(sightings: Sequence[Sighting]) -> Calibration:
-    """Return the logistic regression of being wood on the features (ridge, standardised).
+    """Return the logistic regression of being matched on the features (ridge, standardised).
 
     Where nothing was found, it says one half of everything.
     """
     x = np.concatenate([s.features for s in sightings])
     if not len(x):
         return Calibration(weights=(0.0,) * x.shape[1], bias=0.0)
-    y = np.concatenate([s.judgement.on_wood for s in sightings]).astype(np.float64)
+    y = np.concatenate([s.judgement.at_line for s in sightings]).astype(np.float64)
     middle, spread = x.mean(axis=0), x.std(axis=0) + 1e-9
     z = (x - middle) / spread
 

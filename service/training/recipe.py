@@ -13,11 +13,10 @@ import torch
 
 from canopy_skel.errors import UsageError
 from canopy_skel.segmenters.labels import LabelledImage, without_small
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
-from canopy_skel.segmenters.unet.weights import Model, save
+from canopy_skel.segmenters.unet.weights import UNCALIBRATED, Model, save
 from service.training import builtin
 from service.training.judging import Sighting, calibrated, figures, rescored, sight, threshold
 from service.training.look import Look
@@ -26,12 +25,13 @@ from service.training.store import StoredImages
 
 WANTED_PRECISION = 0.88
 _CANDIDATES = 3
-UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
 BUILTIN_PLANS = (
     Plan(steps=8400, look_every=300, centre_weight=0.5),
     Plan(steps=7500, look_every=300, seed=2, peak_rate=1.5e-3),
 )
 """One after the other: the second goes on from the averaged weights of the first."""
+ZOOM = 1.25
+"""Networks see pictures this much enlarged: the same weights find a tenth more (docs/unet.md)."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -77,7 +77,7 @@ def builtin_weights(
     builtin.draw(folder / "data", amounts, progress)
     validate = StoredImages(folder / "data" / "validate")
     pictures = StoredImages(folder / "data" / "train")
-    look = Look(validate, choosing(validate)[::4])
+    look = Look(validate, choosing(validate)[::4], ZOOM)
     runs: list[Run] = []
     for number, plan in enumerate(plans, start=1):
         own = folder / f"run{number}"
@@ -123,7 +123,7 @@ def finish(run: Run, folder: Path, halves: Halves) -> tuple[Model, dict[str, Any
         UsageError: the folder holds no averaged weights.
     """
     paths = _promising(folder)
-    candidates = [(path, *_candidate(path, run.plan.channels, halves.choose)) for path in paths]
+    candidates = [(path, *_candidate(path, run.plan, halves.choose)) for path in paths]
     chosen_path, model, chosen = max(candidates, key=lambda c: _line_ap(c[2]))
     calibration = calibrated(chosen)
     least = threshold(rescored(chosen, calibration), WANTED_PRECISION)
@@ -157,13 +157,14 @@ def _promising(folder: Path) -> list[Path]:
 
 
 def _candidate(
-    path: Path, channels: tuple[int, ...], images: Sequence[LabelledImage]
+    path: Path, plan: Plan, images: Sequence[LabelledImage]
 ) -> tuple[Model, list[Sighting]]:
-    network = UNet(channels)
+    network = UNet(plan.channels)
     network.load_state_dict(torch.load(path, weights_only=True))
     model = Model(
         network=network.eval(),
-        channels=channels,
+        channels=plan.channels,
+        zoom=ZOOM,
         grouping=Grouping(),
         calibration=UNCALIBRATED,
         least_score=0.0,

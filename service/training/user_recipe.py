@@ -13,10 +13,10 @@ from torch import Tensor
 from canopy_skel.errors import UsageError
 from canopy_skel.segmenters.labels import LabelledImage
 from canopy_skel.segmenters.unet.grouping import Grouping
-from canopy_skel.segmenters.unet.weights import Model, save
+from canopy_skel.segmenters.unet.weights import UNCALIBRATED, Model, save
 from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
-from service.training.recipe import UNCALIBRATED, Halves, finish
+from service.training.recipe import ZOOM, Halves, finish
 from service.training.store import StoredImages, store
 from service.training.user_pictures import UserPicture, labelled, split
 
@@ -121,7 +121,7 @@ def user_weights(
     plan = replace(plan, data=_digest(folder / "data" / "train", state))
     run = resume(plan, folder / "run") or start(plan, state)
     shown = validate if len(validate) else train_set
-    look = Look(shown, range(min(len(shown), 20)))
+    look = Look(shown, range(min(len(shown), 20)), ZOOM)
     train(run, lambda: train_set, folder / "run", look)
     model, facts = _finished(run, folder / "run", [validate[k] for k in range(len(validate))], init)
     facts["training"] |= {"pictures": len(train_set), "scans": imported.scans}
@@ -153,6 +153,7 @@ def _finished(
     model = Model(
         network=run.averaged.eval(),
         channels=run.plan.channels,
+        zoom=ZOOM,
         grouping=Grouping() if init is None else init.grouping,
         calibration=UNCALIBRATED if init is None else init.calibration,
         least_score=0.5 if init is None else init.least_score,

@@ -1,5 +1,6 @@
 from dataclasses import asdict, replace
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,13 +23,15 @@ from canopy_skel.kernels import profile
 from canopy_skel.observe import observe
 from canopy_skel.pieces import PieceConfig, pieces_of, regions_of_masks
 from canopy_skel.pipeline import MethodConfig, Skeletonizer, models_for
+from canopy_skel.recording import read_recording
+from canopy_skel.segmenters.mapping import MappingSegmenter
 from canopy_skel.segmenters.recorded import RecordedSegmenter
-from canopy_skel.wood import FragmentConfig, WoodDetector, fragments_of, wood_probability
-from canopy_skel.woodpixels import (
-    shipped_pixel_model,
-)
+from canopy_skel.segmenters.unet.portable import PortableNetwork
+from canopy_skel.wood import FragmentConfig, fragments_of, wood_probability
+from canopy_skel.woodpixels import shipped_pixel_model
 
 PLAIN = view_from(0)
+DEMO = Path(__file__).parents[2] / "recordings/demo_apple.mcap"
 
 
 @pytest.fixture(scope="module")
@@ -271,22 +274,17 @@ def test_a_view_sees_through_what_is_before_wood_and_never_through_wood(
 
 
 def test_unmasked_wood_is_told_from_leaves():
-    view = PLAIN
-    color = np.zeros((240, 320, 3), np.uint8)
-    noise = np.random.default_rng(0).integers(-8, 9, color.shape)
-    color[:] = np.clip(np.array([60, 120, 40]) + noise, 0, 255)
-    wood = view.instances > 0
-    color[wood] = np.clip(np.array([110, 90, 80]) + noise[wood], 0, 255)
-    depth_m = np.where(np.isnan(view.depth_m), np.float32(1.05), view.depth_m)
-    masked = wood & (view.instances != 3)
-    coloured = replace(PLAIN, color_rgb=color, depth_m=depth_m)
+    view = next(iter(read_recording(DEMO).views()))
+    left_out = (view.instances > 0) & (view.instances % 3 == 0)
+    masked = (view.instances > 0) & ~left_out
     config = FragmentConfig()
-    probability = wood_probability(coloured, masked, config, shipped_pixel_model())
-    found = fragments_of(probability, config.min_probability, config)
-    shown = np.zeros(wood.shape, bool)
+    maps = PortableNetwork().maps(view.color_rgb)
+    probability = wood_probability(view, maps, masked, config, shipped_pixel_model())
+    found = fragments_of(probability, config)
+    shown = np.zeros(masked.shape, bool)
     shown[found.v, found.u] = True
-    assert shown[view.instances == 3].mean() > 0.5  # most of it
-    assert shown[~wood].mean() < 0.01
+    assert shown[left_out].mean() > 0.6
+    assert shown[view.instances == 0].mean() < 0.02  # small wood without a mask among it
     assert not shown[masked].any()
 
 
@@ -329,18 +327,20 @@ def test_what_fragments_show_runs_as_they_point_tips_included(fragments):
     assert (along.min() > 0.9) == fragments
 
 
-def test_a_segmenter_that_knows_wood_is_asked_instead_of_the_colours():
-    class Detector(RecordedSegmenter):
-        def wood_probability(self, view):
-            return np.where(PLAIN.instances == 3, np.float32(0.95), np.float32(0.05))
+def test_a_segmenter_with_maps_of_its_own_is_asked_for_them_and_only_for_fragments():
+    asked = []
 
-    view = PLAIN
-    masks = np.where(view.instances == 3, 0, view.instances).astype(np.uint16)
-    maker = Skeletonizer(Detector(), MethodConfig(name="canopy"))
-    assert isinstance(Detector(), WoodDetector)
-    assert maker.add_view(replace(PLAIN, instances=masks)) == 3
-    without = maker_of([replace(PLAIN, instances=masks)], use_fragments=False)
-    assert maker.skeleton().voxels == without.skeleton().voxels
+    class Network(RecordedSegmenter):
+        def segment_and_map(self, view):
+            asked.append(view.index)
+            return self.segment(view), np.zeros((5, 12, 16), np.float32)
+
+    assert isinstance(Network(), MappingSegmenter)
+    assert not isinstance(RecordedSegmenter(), MappingSegmenter)
+    for use_fragments in (True, False):
+        config = MethodConfig(name="canopy", canopy=CanopyConfig(use_fragments=use_fragments))
+        Skeletonizer(Network(), config).add_view(PLAIN)
+        assert asked == [PLAIN.index]
 
 
 def test_what_one_view_shows_is_believed_less_where_a_network_found_it(views):

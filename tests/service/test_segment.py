@@ -31,6 +31,7 @@ def weights(tmp_path):
     model = Model(
         network=network.eval(),
         channels=CHANNELS,
+        zoom=1.0,
         grouping=Grouping(),
         calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=1.0),
         least_score=0.5,

@@ -163,13 +163,13 @@ def test_the_recipe_goes_from_nothing_to_weights_and_on_where_it_was(tmp_path, m
     assert (tmp_path / "run2" / "log.jsonl").read_text().splitlines()[: len(log)] == log
 
 
-def test_calibrated_scores_are_the_share_that_is_wood():
+def test_calibrated_scores_are_the_share_that_is_matched():
     rng = np.random.default_rng(0)
     features = rng.normal(size=(4000, 3)) * [1, 10, 0.1] + [5, 0, 0]
     real = rng.random(4000) < 1 / (1 + np.exp(-(2 * (features[:, 0] - 5) + 0.1 * features[:, 1])))
     sighting = Sighting(judgement=judgement(real), features=features)
     calibration = calibrated([sighting])
-    assert figures(rescored([sighting], calibration)).ece_wood < 0.03
+    assert figures(rescored([sighting], calibration)).ece < 0.03
     assert calibration.weights[:2] == pytest.approx((2, 0.1), rel=0.15)
 
 
@@ -181,7 +181,7 @@ def judgement(real):
         confidence=np.zeros(len(real)),
         at30=none,
         at50=none,
-        at_line=none,
+        at_line=real,
         on_wood=real,
         true_count=1,
         pixels=np.zeros(3, np.int64),

@@ -15,8 +15,6 @@ from canopy_skel.frame import UInt8Array
 
 CHANNELS = (16, 32, 64, 128, 192)
 """At 1/2, 1/4, 1/8, 1/16 and 1/32 of the picture's size: 1.8 million parameters."""
-MULTIPLE_PX = 32
-"""Pictures must be a multiple of this in height and width."""
 _MEAN, _SCALE = 0.45, 0.25
 
 
@@ -59,6 +57,7 @@ class UNet(nn.Module):
 
     def __init__(self, channels: Sequence[int] = CHANNELS) -> None:
         super().__init__()
+        self.channels = tuple(channels)
         pairs = list(itertools.pairwise(channels))
         self.stem = _convolution(3, channels[0], size=5, stride=2)
         self.down = nn.ModuleList(_convolution(a, b, stride=2) for a, b in pairs)

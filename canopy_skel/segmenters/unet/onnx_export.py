@@ -1,5 +1,7 @@
 """The network for runtimes that do not have torch: ONNX, pictures in, the five maps out."""
 
+import gzip
+import io
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from canopy_skel.errors import UsageError
-from canopy_skel.segmenters.unet.network import MULTIPLE_PX, UNet, scaled
-from canopy_skel.segmenters.unet.weights import Model, fused
+from canopy_skel.segmenters.unet.network import UNet, scaled
+from canopy_skel.segmenters.unet.tiles import MULTIPLE_PX
+from canopy_skel.segmenters.unet.weights import Model
 
 OPSET = 17
 INPUT, OUTPUT = "pictures_rgb", "maps"
@@ -28,18 +31,20 @@ class _Whole(nn.Module):
 
 
 def export_onnx(model: Model, path: Path) -> None:
-    """Write the network as ONNX, opset 17, batch, height and width free.
+    """Write the network as ONNX, opset 17, batch, height and width free; packed if named .gz.
 
     Input `pictures_rgb`: (N, 3, H, W) float32, 0 to 255, H and W multiples of 32 (continue the
-    edge). Output `maps`: (N, 5, H / 2, W / 2), see `network.Maps`; what groups them into instances
-    is not part of it.
+    edge), enlarged as `Model.zoom` says. Output `maps`: (N, 5, H / 2, W / 2), see `network.Maps`;
+    what groups them into instances is not part of it. Normalisations are left as they are, for the
+    runtime to fold in: so the weights keep to what half precision holds, and pack well.
 
     Raises:
         UsageError: the package onnx is not installed, or the file cannot be written.
     """
     if find_spec("onnx") is None:  # Asked here: torch says so by an error of its own kind.
         raise UsageError("ONNX needs the extra `onnx`: pip install 'canopy-skel[onnx]'")
-    network = _Whole(fused(_copied(model)))
+    network = _Whole(_copied(model))
+    buffer = io.BytesIO()
     example = torch.zeros(1, 3, 2 * MULTIPLE_PX, 2 * MULTIPLE_PX)
     free = {0: "count", 2: "height", 3: "width"}
     try:
@@ -49,13 +54,16 @@ def export_onnx(model: Model, path: Path) -> None:
             torch.onnx.export(
                 network,
                 (example,),
-                str(path),
+                buffer,  # type: ignore[arg-type]  # files too, unlike what is declared
                 input_names=[INPUT],
                 output_names=[OUTPUT],
                 dynamic_axes={INPUT: free, OUTPUT: free},
                 opset_version=OPSET,
+                training=torch.onnx.TrainingMode.PRESERVE,
                 dynamo=False,
             )
+        whole = buffer.getvalue()
+        path.write_bytes(gzip.compress(whole, mtime=0) if path.suffix == ".gz" else whole)
     except OSError as error:
         raise UsageError(
             f"{path}: cannot be written ({error.strerror}); check the folder"

@@ -1,7 +1,8 @@
 """The learned segmenter: a view in, scored branch instances out."""
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from math import ceil, floor
 
 import cv2
 import numpy as np
@@ -13,20 +14,20 @@ from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.unet.grouping import Strands, grouped
-from canopy_skel.segmenters.unet.network import MULTIPLE_PX, channels_last, normalised
+from canopy_skel.segmenters.unet.network import channels_last, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.targets import STRIDE
+from canopy_skel.segmenters.unet.tiles import enlarged, tiled
 from canopy_skel.segmenters.unet.weights import Model, fused
 
-TILE_PX = 1536
-_OVERLAP_PX = 192
+TILE_PX = 2048
 _SMALLEST_TILE_PX = 512
 
 
 class UNetSegmenter:
     """Finds branches with the U-Net and groups its maps into instances.
 
-    A picture larger than a tile is seen tile by tile; where memory runs out, the tiles shrink.
+    The network sees pictures enlarged as it was trained to. One larger than a tile then is seen
+    tile by tile; where memory runs out, the tiles shrink.
     """
 
     def __init__(
@@ -62,6 +63,13 @@ class UNetSegmenter:
         Raises:
             ViewError: the picture is not 8-bit colour, or memory does not suffice for it.
         """
+        return self.segment_and_map(view)[0]
+
+    def segment_and_map(self, view: View) -> tuple[Sequence[BranchMask], Float32Array]:
+        """Return what `segment` does, and the maps (5, h, w) it rests on.
+
+        Raises: as `segment`.
+        """
         color = view.color_rgb
         if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
             raise ViewError(
@@ -77,18 +85,19 @@ class UNetSegmenter:
             ) from error
         strands = grouped(maps, self._model.grouping)
         scores = self._model.calibration.scores(strands.features)
-        return masks_of(strands, scores, color.shape[:2], self._model.least_score)
+        return masks_of(strands, scores, color.shape[:2], self._model.least_score), maps
 
     def maps(self, color_rgb: UInt8Array) -> Float32Array:
-        """Return the five maps (5, ceil(H / 2), ceil(W / 2)) of an (H, W, 3) picture.
+        """Return the five maps (5, h, w) of an (H, W, 3) picture; h = ceil(zoom H / 2), w alike.
 
         Raises:
             MemoryError: there is not enough even for small tiles.
         """
+        color_rgb = enlarged(color_rgb, self._model.zoom)
         tile = self._tile_px
         while True:
             try:
-                return self._tiled(color_rgb, tile)
+                return tiled(color_rgb, self._infer, tile)
             except (MemoryError, RuntimeError) as error:
                 if not _is_memory(error):
                     raise
@@ -96,24 +105,11 @@ class UNetSegmenter:
                     raise MemoryError(str(error)) from error
                 tile //= 2
 
-    def _tiled(self, color_rgb: UInt8Array, tile_px: int) -> Float32Array:
-        height, width = color_rgb.shape[:2]
-        out = np.empty((5, -(-height // STRIDE), -(-width // STRIDE)), dtype=np.float32)
-        for rows, own_rows in _spans(height, tile_px):
-            for columns, own_columns in _spans(width, tile_px):
-                part = self._infer(color_rgb[rows, columns])
-                top, left = rows.start // STRIDE, columns.start // STRIDE
-                target = out[:, own_rows, own_columns]
-                i, j = own_rows.start - top, own_columns.start - left
-                target[:] = part[:, i : i + target.shape[1], j : j + target.shape[2]]
-        return out
-
     def _infer(self, color_rgb: UInt8Array) -> Float32Array:
-        """Run the network once; the edge is continued up to the multiple the network needs."""
-        bottom, right = (-size % MULTIPLE_PX for size in color_rgb.shape[:2])
-        padded = np.pad(color_rgb, ((0, bottom), (0, right), (0, 0)), mode="edge")
         with torch.inference_mode():
-            picture = normalised(padded[None]).to(self._device, memory_format=torch.channels_last)
+            picture = normalised(color_rgb[None]).to(
+                self._device, memory_format=torch.channels_last
+            )
             kind = self._device.split(":")[0]
             with torch.autocast(kind, torch.bfloat16, enabled=self._bfloat16):
                 output = self._network(picture)
@@ -126,17 +122,6 @@ def _is_memory(error: MemoryError | RuntimeError) -> bool:
     return known or "allocate memory" in str(error)
 
 
-def _spans(size: int, tile_px: int) -> Iterator[tuple[slice, slice]]:
-    """Yield the pixels each tile sees, and the cells of the output that are its own."""
-    step = tile_px - _OVERLAP_PX
-    count = max(-(-(size - _OVERLAP_PX) // step), 1)
-    for k in range(count):
-        start, end = k * step, min(k * step + tile_px, size)
-        first = start + (_OVERLAP_PX // 2 if k else 0)
-        last = end - _OVERLAP_PX // 2 if k + 1 < count else size
-        yield slice(start, end), slice(first // STRIDE, -(-last // STRIDE))
-
-
 def masks_of(
     strands: Strands, scores: FloatArray, size: tuple[int, int], least_score: float
 ) -> list[BranchMask]:
@@ -145,17 +130,21 @@ def masks_of(
     They keep their numbers in `strands`. Their outlines run where the branch map, interpolated
     between cells, falls to its threshold.
     """
-    height, width = size
     masks: list[BranchMask] = []
+    cell_px = np.array(size) / strands.label.shape
     for number, box in enumerate(find_objects(strands.label), start=1):
         if box is None or scores[number - 1] < least_score:
             continue
-        top, left = STRIDE * box[0].start, STRIDE * box[1].start
-        own = (strands.label[box] == number).astype(np.uint8)
-        full = (own.shape[1] * STRIDE, own.shape[0] * STRIDE)
-        sharp = cv2.resize(strands.surplus[box], full, interpolation=cv2.INTER_LINEAR) > 0
-        mask = sharp & (cv2.resize(own, full, interpolation=cv2.INTER_NEAREST) > 0)
-        mask = mask[: height - top, : width - left]
+        pixels = [
+            np.arange(floor(span.start * cell), ceil(span.stop * cell))
+            for span, cell in zip(box, cell_px, strict=True)
+        ]
+        rows, columns = ((at + 0.5) / cell for at, cell in zip(pixels, cell_px, strict=True))
+        mask = strands.label[rows.astype(np.int64)[:, None], columns.astype(np.int64)] == number
+        u, v = np.meshgrid((columns - 0.5).astype(np.float32), (rows - 0.5).astype(np.float32))
+        rim = cv2.BORDER_REPLICATE
+        mask &= cv2.remap(strands.surplus, u, v, cv2.INTER_LINEAR, borderMode=rim) > 0
+        top, left = int(pixels[0][0]), int(pixels[1][0])
         if mask.any():
             masks.append(
                 BranchMask(

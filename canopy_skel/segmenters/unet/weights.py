@@ -29,6 +29,8 @@ FORMAT = "canopy-unet/1"
 BUILTIN = Path(str(files(__package__) / "builtin.pt"))
 _MOST_BYTES = 64 << 20
 _MOST_CHANNELS = 4096
+UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
+"""Scores for a network nobody has calibrated."""
 _NEEDED = frozenset({"channels", "features", "grouping", "calibration", "least_score"})
 
 
@@ -36,11 +38,12 @@ _NEEDED = frozenset({"channels", "features", "grouping", "calibration", "least_s
 class Model:
     """A trained network and how its maps become instances.
 
-    least_score: instances below are not reported.
+    zoom: how much enlarged it sees pictures. least_score: instances below are not reported.
     """
 
     network: UNet
     channels: tuple[int, ...]
+    zoom: float
     grouping: Grouping
     calibration: Calibration
     least_score: float
@@ -51,6 +54,7 @@ def save(path: Path, model: Model, provenance: dict[str, Any]) -> None:
     description = {
         "format": FORMAT,
         "channels": list(model.channels),
+        "zoom": model.zoom,
         "features": list(FEATURES),
         "grouping": asdict(model.grouping),
         "calibration": asdict(model.calibration),
@@ -72,7 +76,7 @@ def load(path: Path = BUILTIN) -> Model:
             f"{path}: its scores rest on other features than this version's; train anew, or use the"
             " version that wrote it"
         )
-    channels, grouping, calibration, least_score = _settings(path, description)
+    channels, zoom, grouping, calibration, least_score = _settings(path, description)
     network = UNet(channels)
     state = read_state(path, description["sha256"], _MOST_BYTES)
     require_fit(path, network.state_dict(), state)
@@ -80,6 +84,7 @@ def load(path: Path = BUILTIN) -> Model:
     return Model(
         network=network.eval(),
         channels=channels,
+        zoom=zoom,
         grouping=grouping,
         calibration=calibration,
         least_score=least_score,
@@ -88,8 +93,8 @@ def load(path: Path = BUILTIN) -> Model:
 
 def _settings(
     path: Path, description: Mapping[str, Any]
-) -> tuple[tuple[int, ...], Grouping, Calibration, float]:
-    """Return channels, grouping, calibration and least score that a description holds.
+) -> tuple[tuple[int, ...], float, Grouping, Calibration, float]:
+    """Return channels, zoom, grouping, calibration and least score that a description holds.
 
     Raises:
         UsageError: it holds something else.
@@ -99,6 +104,7 @@ def _settings(
         given = description["calibration"]
         calibration = Calibration(weights=tuple(map(float, given["weights"])), bias=given["bias"])
         least_score = float(description["least_score"])
+        zoom = float(description.get("zoom", 1.0))
         if len(channels) < 2 or not 0 < min(channels) <= max(channels) <= _MOST_CHANNELS:
             raise ValueError(f"{channels} are no channels")
         if len(calibration.weights) != len(FEATURES):
@@ -107,9 +113,11 @@ def _settings(
         numbers = [*asdict(grouping).values(), *calibration.weights, calibration.bias]
         if not np.isfinite(numbers).all():
             raise ValueError("not all numbers are finite")
+        if not 0.1 <= zoom <= 10:
+            raise ValueError(f"zoom is {zoom}, not from 0.1 to 10")
         if not 0 <= least_score <= 1:
             raise ValueError(f"least_score is {least_score}, not from 0 to 1")
-        return channels, grouping, calibration, least_score
+        return channels, zoom, grouping, calibration, least_score
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
             f"{path.with_suffix('.json')}: does not say how the network is used ({error}); copy"

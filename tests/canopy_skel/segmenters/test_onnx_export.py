@@ -1,5 +1,6 @@
 """The exported network says what torch says, at any size."""
 
+import gzip
 import sys
 
 import numpy as np
@@ -33,6 +34,7 @@ def model():
     return Model(
         network=network.eval(),
         channels=channels,
+        zoom=1.0,
         grouping=Grouping(),
         calibration=calibration,
         least_score=0.5,
@@ -52,6 +54,14 @@ def test_onnxruntime_gives_the_maps_of_torch(onnxruntime, model, tmp_path):
         (maps,) = session.run([OUTPUT], {INPUT: given})
         assert maps.shape == (count, 5, height // 2, width // 2)
         np.testing.assert_allclose(maps, expected, atol=2e-4)
+
+
+@pytest.mark.usefixtures("onnxruntime")
+def test_a_name_in_gz_packs_it(model, tmp_path):
+    export_onnx(model, tmp_path / "unet.onnx")
+    export_onnx(model, tmp_path / "unet.onnx.gz")
+    packed = (tmp_path / "unet.onnx.gz").read_bytes()
+    assert gzip.decompress(packed) == (tmp_path / "unet.onnx").read_bytes()
 
 
 @pytest.mark.usefixtures("onnxruntime")

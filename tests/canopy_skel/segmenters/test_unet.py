@@ -2,6 +2,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.unet import segmenter as module
 from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.grouping import Calibration, Grouping, Strands
 from canopy_skel.segmenters.unet.network import UNet
+from canopy_skel.segmenters.unet.portable import PortableNetwork
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, masks_of
 from canopy_skel.segmenters.unet.weights import Model, load
 
 DEMO = Path(__file__).parents[3] / "recordings/demo_apple.mcap"
@@ -26,6 +28,8 @@ import sys
 import canopy_skel.pipeline, canopy_skel.recording, canopy_skel.segmenters.recorded
 import canopy_skel.segmenters.labels, canopy_skel.segmenters.unet.grouping
 import canopy_skel.segmenters.unet.targets, canopy_skel.metrics.segmentation
+import canopy_skel.segmenters.mapping, canopy_skel.segmenters.unet.portable
+canopy_skel.segmenters.unet.portable.PortableNetwork()
 import service.cli, service.replay, service.worker, service.compose, service.skeletons
 service.skeletons.SEGMENTERS["recorded"]()
 print("torch" in sys.modules)
@@ -57,6 +61,7 @@ def untrained():
     return Model(
         network=UNet(channels).eval(),
         channels=channels,
+        zoom=1.0,
         grouping=Grouping(),
         calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=0.0),
         least_score=0.0,
@@ -105,11 +110,45 @@ def test_segmenting_keeps_to_one_core_however_many_there_are():
     assert done.stdout.split() == ["1", "PASSIVE", "True"]
 
 
+@pytest.mark.parametrize("zoom", [1.0, 1.25, 0.5])
 @pytest.mark.parametrize("size", [(1, 1), (3, 500), (97, 131), (64, 64)])
-def test_pictures_of_any_size_get_maps_of_half_of_it(untrained, size):
-    maps = UNetSegmenter(untrained).maps(noise(*size))
-    assert maps.shape == (5, -(-size[0] // 2), -(-size[1] // 2))
+def test_pictures_of_any_size_get_maps_of_half_of_it_enlarged(untrained, size, zoom):
+    maps = UNetSegmenter(replace(untrained, zoom=zoom)).maps(noise(*size))
+    assert maps.shape == (5, ceil(size[0] * zoom / 2), ceil(size[1] * zoom / 2))
     assert np.isfinite(maps).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (31, 500), (240, 320)])
+def test_without_torch_the_built_in_network_says_the_same(builtin, size):
+    expected, maps = builtin.maps(noise(*size)), PortableNetwork().maps(noise(*size))
+    assert maps.shape == expected.shape
+    assert np.allclose(maps, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("zoom", [0.7, 1.0, 1.25])
+def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
+    height, width = 75, 111
+    grid = ceil(height * zoom / 2), ceil(width * zoom / 2)
+    label = np.zeros(grid, np.int32)
+    middle = grid[1] // 2
+    label[:, 2:middle], label[:, middle:-2] = 1, 2
+    surplus = np.ones(grid, np.float32)
+    surplus[: grid[0] // 2] = -1
+    strands = Strands(label=label, surplus=surplus, features=np.zeros((2, len(FEATURES))))
+    masks = masks_of(strands, np.array([0.4, 0.9]), (height, width), least_score=0.0)
+    shown = np.zeros((height, width), int)
+    for mask in masks:
+        rows, columns = mask.mask.shape
+        box = np.s_[mask.top_px : mask.top_px + rows, mask.left_px : mask.left_px + columns]
+        assert shown[box].shape == mask.mask.shape
+        shown[box] += mask.mask
+    cell_px = np.array([height, width]) / grid
+    v, u = np.mgrid[:height, :width] + 0.5
+    inside = (u > 2 * cell_px[1]) & (u < (grid[1] - 2) * cell_px[1])
+    edge = abs(v - (grid[0] // 2) * cell_px[0]) < 1
+    assert shown.max() == 1
+    assert np.array_equal((shown > 0) & ~edge, inside & (v > (grid[0] // 2) * cell_px[0]) & ~edge)
+    assert [mask.confidence for mask in masks] == [0.4, 0.9]
 
 
 def test_tiles_fit_together_without_a_seam(untrained):

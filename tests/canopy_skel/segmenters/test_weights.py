@@ -20,6 +20,7 @@ def model():
     return Model(
         network=UNet(SMALL).eval(),
         channels=SMALL,
+        zoom=1.5,
         grouping=Grouping(branch=0.6),
         calibration=Calibration(weights=tuple(map(float, range(len(FEATURES)))), bias=-2.0),
         least_score=0.3,
@@ -46,7 +47,7 @@ def test_what_was_saved_is_loaded(model, saved):
     again = load(saved)
     assert again.grouping == model.grouping
     assert again.calibration == model.calibration
-    assert (again.channels, again.least_score) == (SMALL, 0.3)
+    assert (again.channels, again.zoom, again.least_score) == (SMALL, 1.5, 0.3)
     wanted = model.network.state_dict()
     for name, value in again.network.state_dict().items():
         assert value.dtype == wanted[name].dtype
@@ -111,6 +112,8 @@ def test_a_description_that_is_missing_old_or_short_is_named(saved):
     "changes",
     [
         {"channels": []},
+        {"zoom": 0},
+        {"zoom": "large"},
         {"channels": "many"},
         {"channels": [4, -6, 8]},
         {"grouping": None},

@@ -1,0 +1,59 @@
+"""A picture to the maps of a network that sees it enlarged, and tile by tile where it is large."""
+
+from collections.abc import Callable, Iterator
+from math import ceil
+
+import cv2
+import numpy as np
+
+from canopy_skel.frame import Float32Array, UInt8Array
+from canopy_skel.segmenters.unet.targets import STRIDE
+
+MULTIPLE_PX = 32
+"""The network wants pictures that are a multiple of this in height and width."""
+MAPS = 5
+_OVERLAP_PX = 192
+
+
+def enlarged(color_rgb: UInt8Array, zoom: float) -> UInt8Array:
+    """Return an (H, W, 3) picture `zoom` times as large, each side a multiple of the stride."""
+    height, width = (STRIDE * ceil(size * zoom / STRIDE) for size in color_rgb.shape[:2])
+    if (height, width) == color_rgb.shape[:2]:
+        return color_rgb
+    larger = cv2.resize(color_rgb, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(larger, dtype=np.uint8)
+
+
+def tiled(
+    color_rgb: UInt8Array, infer: Callable[[UInt8Array], Float32Array], tile_px: int
+) -> Float32Array:
+    """Return the maps (5, H / 2, W / 2) of an (H, W, 3) picture, H and W even.
+
+    infer: runs the network on a picture of `MULTIPLE_PX`; the edge is continued up to that.
+    """
+    height, width = color_rgb.shape[:2]
+    out = np.empty((MAPS, height // STRIDE, width // STRIDE), dtype=np.float32)
+    for rows, own_rows in _spans(height, tile_px):
+        for columns, own_columns in _spans(width, tile_px):
+            part = infer(_padded(color_rgb[rows, columns]))
+            top, left = rows.start // STRIDE, columns.start // STRIDE
+            target = out[:, own_rows, own_columns]
+            i, j = own_rows.start - top, own_columns.start - left
+            target[:] = part[:, i : i + target.shape[1], j : j + target.shape[2]]
+    return out
+
+
+def _padded(color_rgb: UInt8Array) -> UInt8Array:
+    bottom, right = (-size % MULTIPLE_PX for size in color_rgb.shape[:2])
+    return np.pad(color_rgb, ((0, bottom), (0, right), (0, 0)), mode="edge")
+
+
+def _spans(size: int, tile_px: int) -> Iterator[tuple[slice, slice]]:
+    """Yield the pixels each tile sees, and the cells of the output that are its own."""
+    step = tile_px - _OVERLAP_PX
+    count = max(-(-(size - _OVERLAP_PX) // step), 1)
+    for k in range(count):
+        start, end = k * step, min(k * step + tile_px, size)
+        first = start + (_OVERLAP_PX // 2 if k else 0)
+        last = end - _OVERLAP_PX // 2 if k + 1 < count else size
+        yield slice(start, end), slice(first // STRIDE, -(-last // STRIDE))
