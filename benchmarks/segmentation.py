@@ -34,7 +34,7 @@ SHOWN = {
     "recall": "recall",
     "pixel_iou": "pixel IoU",
     "cl_dice": "clDice",
-    "ece_wood": "ECE (wood)",
+    "ece": "ECE",
     "instances_true": "branches",
 }
 ENDS = (

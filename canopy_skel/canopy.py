@@ -30,7 +30,7 @@ from canopy_skel.slivers import inside_thicker
 from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
-POINT_FEATURES = 23
+POINT_FEATURES = 27
 NO_MAP_NATS = 12.0
 """-log p where the likelihood map says nothing."""
 

@@ -38,9 +38,9 @@ class Observation:
 
     splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
     instances without enough depth. points_in_base, directions: (N, 3), along the pieces; piece:
-    (N,), which of them, ascending; radius_m, fragment: (N,); quality: (N, 8), score, quality of the
-    piece, log of half its area over its length. evidence: the view, ready to be asked. cells: (N,)
-    cell numbers ascending, of the points in the order `by_cell` (N,).
+    (N,), which of them, ascending; radius_m, fragment: (N,); quality: (N, 12), see `_quality`.
+    evidence: the view, ready to be asked. cells: (N,) cell numbers ascending, of the points in the
+    order `by_cell` (N,).
     """
 
     splines: list[BranchSpline]
@@ -100,7 +100,7 @@ def observe(
     if fragments_config is not None and maps is not None:
         model = pixel_model or shipped_pixel_model()
         probability = wood_probability(view, maps, wood, fragments_config, model)
-        fragments = fragments_of(probability, fragments_config)
+        fragments = fragments_of(probability, maps, fragments_config)
         pieces += pieces_of(view, fragments, pieces_config, fragments=True)
         wood[fragments.v, fragments.u] = True
     points, directions, of = sampled(pieces)
@@ -123,12 +123,17 @@ def observe(
 
 
 def _quality(pieces: list[Piece]) -> FloatArray:
-    """Return the figures (R, 8) by which pieces are judged; see `Observation`."""
+    """Return the figures (R, 12) by which pieces are judged.
+
+    Score, quality of the piece, log of half its area over its length; of fragments, how far the
+    network's directions agree, and its logits as in `Regions`.
+    """
     if not pieces:
-        return np.zeros((0, 8))
+        return np.zeros((0, 12))
     quality = np.array([piece.quality for piece in pieces])
     pixels, length_px, width_px, valid, inlier, lateral = quality.T
     radius_m = np.array([piece.spline.radius_m for piece in pieces])
+    cosine, sine, *logits = np.array([piece.said for piece in pieces]).T
     return np.column_stack(
         [
             [piece.spline.confidence for piece in pieces],
@@ -139,6 +144,8 @@ def _quality(pieces: list[Piece]) -> FloatArray:
             inlier,
             lateral,
             np.log(radius_m * 0.5 * width_px / half_width_px(quality)),
+            np.hypot(cosine, sine),
+            *logits,
         ]
     )
 

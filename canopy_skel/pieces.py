@@ -17,6 +17,8 @@ from canopy_skel.kernels import profile
 from canopy_skel.segment import BranchMask
 from canopy_skel.spline import BranchSpline
 
+SAID = 5
+"""Figures that a network says of a region, see `Regions`."""
 _MOST_KNOTS = 8
 """As in `kernels.profile`, which must not be compiled for settings."""
 
@@ -30,7 +32,8 @@ class PieceConfig:
     the profile (growing with the square of the distance beyond 1.25 m); a region with depth on less
     than `min_valid_share` of its pixels is dropped, and so is an instance thicker than `thickest_m`
     in radius, a fragment thicker than `thickest_fragment_m`: no branch. centre_shift: by how many
-    radii the visible surface is moved away from the camera.
+    radii the visible surface is moved away from the camera. way_px: the length of a region at which
+    its own pixels say as much of its direction as a network does.
     """
 
     knot_px: float = 12.0
@@ -42,6 +45,7 @@ class PieceConfig:
     thickest_m: float = 0.15
     thickest_fragment_m: float = 0.04
     centre_shift: float = np.pi / 4
+    way_px: float = 60.0
 
     def __post_init__(self) -> None:
         """Refuse a range of depth that is none, and knots for which kernels have no room."""
@@ -58,7 +62,9 @@ class Regions:
     """Pixel sets of one view: u, v (N,); region i holds pixels start[i] up to start[i + 1].
 
     confidence: (R,), the segmenter's score or the mean wood probability. numbers: (R,) instance
-    numbers, 0 for fragments.
+    numbers, 0 for fragments. said: (R, 5), what a network says of their pixels: means of cos 2θ and
+    sin 2θ of the direction (u right, v down) and of the logits of branch and middle line, and the
+    highest of the latter; 0 without one.
     """
 
     u: IntArray
@@ -66,6 +72,7 @@ class Regions:
     start: IntArray
     confidence: FloatArray
     numbers: IntArray
+    said: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -73,12 +80,13 @@ class Piece:
     """One region lifted into base: its polyline, and what tells how far to believe it.
 
     quality: (6,) pixels, length_px, width_px, share of pixels with depth, share of these on the
-    profile, lateral deviation over width.
+    profile, lateral deviation over width. said: (5,), see `Regions`.
     """
 
     spline: BranchSpline
     fragment: bool
     quality: FloatArray
+    said: FloatArray
 
 
 def regions_of_masks(masks: Sequence[BranchMask]) -> Regions:
@@ -96,6 +104,7 @@ def regions_of_masks(masks: Sequence[BranchMask]) -> Regions:
         start=np.cumsum([0] + [len(v) for v, _ in places]),
         confidence=np.array([mask.confidence for mask in masks], dtype=np.float64),
         numbers=np.array([mask.instance for mask in masks], dtype=np.int64),
+        said=np.zeros((len(masks), SAID)),
     )
 
 
@@ -112,6 +121,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         regions.v.astype(np.float64),
         depth_m,
         regions.start.astype(np.int64),
+        regions.said[:, :2] * (config.way_px**2 / 12),
         camera.fx_px,
         config.knot_px,
         config.fragment_knots if fragments else profile.MAX_KNOTS,
@@ -130,6 +140,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
             ),
             fragment=fragments,
             quality=quality[i],
+            said=regions.said[i],
         )
         for i, radius, line in zip(kept.tolist(), radius_m, points, strict=True)
     ]

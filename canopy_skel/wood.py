@@ -10,7 +10,7 @@ from canopy_skel.components import pixels_of, runs_of
 from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import BoolArray, IntArray
 from canopy_skel.pieces import Regions, depth_of
-from canopy_skel.woodpixels import PixelModel, hints_of, lab_of, layers_of
+from canopy_skel.woodpixels import MOST_LOGIT, PixelModel, hints_of, lab_of, layers_of
 
 _SPREAD = 4
 """Colours count up to so many bins from their own."""
@@ -121,8 +121,11 @@ def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray
         return np.asarray((depth_m >= low - config.margin_m) & (depth_m <= high + config.margin_m))
 
 
-def fragments_of(probability: Float32Array, config: FragmentConfig) -> Regions:
-    """Return the connected components of probable wood, in raster order of blocks of pixels."""
+def fragments_of(probability: Float32Array, maps: Float32Array, config: FragmentConfig) -> Regions:
+    """Return the connected components of probable wood, in raster order of blocks of pixels.
+
+    probability: (H, W). maps: (5, h, w) of the network, which knows where they run.
+    """
     runs = runs_of(probability >= config.min_probability)
     kept = np.flatnonzero((runs.area >= config.min_px) & (runs.area <= config.max_px))
     # By the first block of 2 x 2 pixels that any pixel is in; within a component by row.
@@ -135,12 +138,23 @@ def fragments_of(probability: Float32Array, config: FragmentConfig) -> Regions:
     heads = np.flatnonzero(np.diff(of, prepend=-1))
     sizes = runs.area[order][heads]
     start = np.concatenate([[0], np.cumsum(sizes)])
-    mean = (
-        np.add.reduceat(probability[v, u].astype(np.float64), start[:-1]) / sizes
-        if len(sizes)
-        else np.zeros(0)
+    row = (v + 0.5) * maps.shape[1] / probability.shape[0]
+    column = (u + 0.5) * maps.shape[2] / probability.shape[1]
+    cells = maps[:4, row.astype(np.int64), column.astype(np.int64)]
+    branch, centre = np.clip(cells[:2], -MOST_LOGIT, MOST_LOGIT)
+    each = np.column_stack([probability[v, u], *cells[2:], branch, centre]).astype(np.float64)
+    mean, highest = np.zeros((0, 5)), np.zeros(0)
+    if len(sizes):
+        mean = np.add.reduceat(each, start[:-1], axis=0) / sizes[:, None]
+        highest = np.maximum.reduceat(each[:, 4], start[:-1])
+    return Regions(
+        u=u,
+        v=v,
+        start=start,
+        confidence=mean[:, 0],
+        numbers=np.zeros(len(sizes), np.int64),
+        said=np.column_stack([mean[:, 1:], highest]),
     )
-    return Regions(u=u, v=v, start=start, confidence=mean, numbers=np.zeros(len(sizes), np.int64))
 
 
 def _histogram(bins: np.ndarray) -> np.ndarray:

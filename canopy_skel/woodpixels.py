@@ -18,7 +18,7 @@ from canopy_skel.pieces import depth_of
 PIXEL_MODEL_FILE = "wood-pixels.json"
 _MOST_ODDS = 4.0
 _BLUR_PX = 0.7
-_MOST_LOGIT = 8.0
+MOST_LOGIT = 8.0
 _NEAR_CELLS, _AROUND_CELLS = 5, 3.75
 
 
@@ -82,7 +82,7 @@ def hints_of(maps: Float32Array) -> Float32Array:
     The logits of branch and middle line, the logarithm of the radius, and around each cell the
     highest logit of branch and their mean.
     """
-    branch, centre = np.clip(maps[:2], -_MOST_LOGIT, _MOST_LOGIT)
+    branch, centre = np.clip(maps[:2], -MOST_LOGIT, MOST_LOGIT)
     near = cv2.dilate(branch, np.ones((_NEAR_CELLS, _NEAR_CELLS), np.uint8))
     around_it = cv2.GaussianBlur(branch, (0, 0), _AROUND_CELLS)
     return np.asarray(cv2.merge([branch, centre, maps[4], near, around_it]), dtype=np.float32)

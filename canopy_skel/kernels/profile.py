@@ -132,9 +132,12 @@ def best_line(
     return best_0, best_slope
 
 
-@inner("UniTuple(float64, 4)(float64[::1], float64[::1])")
-def principal_axis(u: Floats, v: Floats) -> tuple[float, float, float, float]:
-    """Return the mean (2) and the unit axis (2) of largest spread; its larger part is positive."""
+@inner("UniTuple(float64, 4)(float64[::1], float64[::1], float64[::1])")
+def principal_axis(u: Floats, v: Floats, way: Floats) -> tuple[float, float, float, float]:
+    """Return the mean (2) and the unit axis (2) of largest spread; its larger part is positive.
+
+    way: (2,) added to the difference of the spreads along u and v, and to twice what they share.
+    """
     n = len(u)
     mu = mv = uu = uv = vv = 0.0
     for i in range(n):
@@ -143,7 +146,7 @@ def principal_axis(u: Floats, v: Floats) -> tuple[float, float, float, float]:
     for i in range(n):
         du, dv = u[i] - mu, v[i] - mv
         uu, uv, vv = uu + du * du, uv + du * dv, vv + dv * dv
-    angle = 0.5 * math.atan2(2.0 * (uv / n), uu / n - vv / n)
+    angle = 0.5 * math.atan2(2.0 * (uv / n) + way[1], uu / n - vv / n + way[0])
     return mu, mv, math.cos(angle), math.sin(angle)
 
 
@@ -233,13 +236,14 @@ def seen(z: Floats, x: Floats, d: Floats) -> int:
 
 
 @inner(
-    "int64(float64[::1], float64[::1], float64[::1], float64, float64, int64, float64, float64,"
-    " float64[:,::1], float64[::1])"
+    "int64(float64[::1], float64[::1], float64[::1], float64[::1], float64, float64, int64,"
+    " float64, float64, float64[:,::1], float64[::1])"
 )
 def fit_region(
     u: Floats,
     v: Floats,
     z: Floats,
+    way: Floats,
     f_px: float,
     knot_px: float,
     max_knots: int,
@@ -250,6 +254,8 @@ def fit_region(
 ) -> int:
     """Fit one region of N pixels (u, v) with depth z (NaN where there is none).
 
+    way: (2,) what is known of its direction beforehand, see `fit_regions`.
+
     Writes rows (u, v, disparity) per knot and the quality; returns the number of knots, 0 where
     there is too little depth.
     """
@@ -257,7 +263,7 @@ def fit_region(
     if n == 0:
         return 0
     x, d = np.empty(n), np.empty(n)
-    axis = principal_axis(u, v)
+    axis = principal_axis(u, v, way)
     low, span = straightened(u, v, axis, x, d)
     count = min(max(int(span / knot_px + 0.5) + 1, 2), max_knots)
     lateral, values = np.empty(count), np.empty(count)
@@ -287,13 +293,14 @@ def fit_region(
 
 @kernel(
     "Tuple((int64[::1], float64[:,:,::1], float64[:,::1]))(float64[::1], float64[::1],"
-    " float64[::1], int64[::1], float64, float64, int64, float64, float64)"
+    " float64[::1], int64[::1], float64[:,::1], float64, float64, int64, float64, float64)"
 )
 def fit_regions(
     u: Floats,
     v: Floats,
     z: Floats,
     start: Ints,
+    ways: Floats,
     f_px: float,
     knot_px: float,
     max_knots: int,
@@ -301,6 +308,9 @@ def fit_regions(
     min_valid: float,
 ) -> tuple[Ints, Floats, Floats]:
     """Fit R regions; region i holds the pixels start[i] up to start[i + 1].
+
+    ways: (R, 2) cos 2θ and sin 2θ of directions (u right, v down) known beforehand, times the
+    difference of squared spreads (px²) along and across at which they count as much as the pixels.
 
     Returns knots per region (R,), rows (R, MAX_KNOTS, 3) of (u, v, disparity), quality (R, Q).
     """
@@ -311,7 +321,7 @@ def fit_regions(
     for i in range(regions):
         a, b = start[i], start[i + 1]
         counts[i] = fit_region(
-            u[a:b], v[a:b], z[a:b], f_px, knot_px, max_knots, tolerance_m, min_valid,
+            u[a:b], v[a:b], z[a:b], ways[i], f_px, knot_px, max_knots, tolerance_m, min_valid,
             knots[i], quality[i],
         )  # fmt: skip
     return counts, knots, quality

@@ -210,6 +210,26 @@ def test_a_wall_is_no_branch():
     assert len(pieces_of(view, regions, thicker, fragments=False)) == 1
 
 
+@pytest.mark.parametrize("degrees", [0, 35, 90, 160])
+def test_a_small_fragment_runs_as_the_network_says_and_a_long_one_as_its_pixels_do(degrees):
+    angle = np.radians(degrees)
+    probability = np.zeros((240, 320), np.float32)
+    probability[100:104, 60:64] = 0.9
+    probability[150:154, 100:300] = 0.9
+    maps = np.zeros((5, 60, 80), np.float32)
+    maps[2], maps[3] = np.cos(2 * angle), np.sin(2 * angle)
+    regions = fragments_of(probability, maps, FragmentConfig())
+    view = replace(PLAIN, depth_m=np.ones((240, 320), dtype=np.float32))
+    for piece, expected in zip(
+        pieces_of(view, regions, PieceConfig(), fragments=True), (angle, 0.0), strict=True
+    ):
+        knots = piece.spline.control_points_in_base
+        # The camera looks along x: u is -y of base, v is -z.
+        way = (knots[0] - knots[-1])[1:]
+        turn = np.arctan2(way[1], way[0]) - expected
+        assert abs(np.degrees(np.arcsin(np.sin(turn)))) < 6
+
+
 def test_a_mask_without_pixels_is_dropped_and_the_others_are_not():
     masks = list(RecordedSegmenter().segment(PLAIN))
     hollow = replace(masks[0], instance=99, mask=np.zeros((4, 9), np.bool_))
@@ -280,7 +300,7 @@ def test_unmasked_wood_is_told_from_leaves():
     config = FragmentConfig()
     maps = PortableNetwork().maps(view.color_rgb)
     probability = wood_probability(view, maps, masked, config, shipped_pixel_model())
-    found = fragments_of(probability, config)
+    found = fragments_of(probability, maps, config)
     shown = np.zeros(masked.shape, bool)
     shown[found.v, found.u] = True
     assert shown[left_out].mean() > 0.6

@@ -11,7 +11,7 @@ from canopy_skel.components import painted, pixels_of, runs_of
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, UNKNOWN, WOOD, evidence_of
 from canopy_skel.kernels import around, verdicts
 from canopy_skel.wood import FragmentConfig, fragments_of
-from canopy_skel.woodpixels import PixelModel
+from canopy_skel.woodpixels import PixelModel, figures_of
 
 SHAPES = [(40, 60), (41, 57), (1, 9), (9, 1)]
 
@@ -42,8 +42,8 @@ def test_components_are_those_of_the_library(shape, share):
 @pytest.mark.parametrize("seed", range(4))
 def test_fragments_come_in_the_order_of_the_librarys_labels(seed):
     probability = np.where(noise((60, 81), 0.45, seed), np.float32(0.8), np.float32(0.1))
-    config = FragmentConfig(min_px=3, max_px=200)
-    found = fragments_of(probability, 0.5, config)
+    config = FragmentConfig(min_probability=0.5, min_px=3, max_px=200)
+    found = fragments_of(probability, np.zeros((5, 30, 41), np.float32), config)
     _, labels, stats, _ = cv2.connectedComponentsWithStats((probability > 0.5).astype(np.uint8))
     area = stats[1:, cv2.CC_STAT_AREA]
     kept = 1 + np.flatnonzero((area >= 3) & (area <= 200))
@@ -133,12 +133,28 @@ def test_colours_spread_as_if_all_of_them_were_worked_through(colours):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"first": (50, 3)}, {"first": (51, 2)}, {"first_bias": 4}, {"second": 2}]
+    "wrong", [{"first": (51, 3)}, {"first": (56, 2)}, {"first_bias": 4}, {"second": 2}]
 )
 def test_a_model_fitted_to_other_figures_is_refused(wrong):
     shapes = {"first": (around.FIGURES, 3), "first_bias": 3, "second": 3}
     arrays = {name: np.zeros(shape, np.float32) for name, shape in (shapes | wrong).items()}
     model = PixelModel(**arrays, second_bias=0.0, provenance="")
     layers, one = np.zeros((4, 4, 4), np.float32), np.ones(1, np.int64)
+    hints = np.zeros((2, 2, around.HINTS), np.float32)
     with pytest.raises(ValueError, match="fit it again"):
-        model.probability(layers, np.zeros(1, np.float32), one, one)
+        model.probability(layers, hints, np.zeros(1, np.float32), one, one)
+
+
+@pytest.mark.parametrize("grid", [(20, 30), (50, 75), (40, 60), (1, 1)])
+def test_hints_are_read_between_the_cells_of_their_own_grid(grid):
+    height, width = 40, 60
+    v, u = (np.array(one) for one in ([0, 7, 21, 39], [59, 3, 30, 0]))
+    row, column = np.mgrid[: grid[0], : grid[1]] + 0.5
+    ramp = np.stack([row / grid[0], column / grid[1], *[np.ones(grid)] * 3], axis=-1)
+    layers, odds = np.zeros((height, width, 4), np.float32), np.zeros(4, np.float32)
+    found = figures_of(layers, ramp.astype(np.float32), odds, v, u)[:, 3 : around.OWN]
+    places = ((v + 0.5) / height, (u + 0.5) / width)
+    for column, (place, count) in enumerate(zip(places, grid, strict=True)):
+        expected = place.clip(0.5 / count, 1 - 0.5 / count)
+        np.testing.assert_allclose(found[:, column], expected, atol=1e-6)
+    np.testing.assert_allclose(found[:, 2:], 1)
