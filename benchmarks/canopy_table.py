@@ -87,10 +87,11 @@ set on other trees (the models' file names them; no walnut is among them). Colum
 in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it
 (there was one after the view before, as in a live scan), without segmentation and the network's
 maps; other work on the machine adds to it. The number behind a recording is the share of its truth
-that no mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the simulated ones; fragments are told by colour, by the built-in network and by
-what lies around each pixel, and simulated pictures are not an orchard's: the rows "masks only" do
-not depend on them. (Network and models learned from pictures of the renderer of those numbered 005
-and 006, of other trees; the four without a number were made by another.)
+that no mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the
+simulated ones; fragments are told by colour, by the built-in network and by what lies around each
+pixel, and simulated pictures are not an orchard's: the rows "masks only" do not depend on them.
+(Network and models learned from pictures of the renderer of those numbered 005 and 006, of other
+trees; the four without a number were made by another.)
 Rows with *worse masks* (a quarter dropped, a fifth false) and with the masks of the built-in
 *unet* show what a real detector would leave of it; they use the confidences for learned masks.
 Depth counts up to 3 m, so trees of the next row do not.

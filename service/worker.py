@@ -22,6 +22,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NoReturn
 
+import cv2
 import zenoh
 
 from canopy_skel.errors import CanopyError
@@ -214,6 +215,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     """Run a worker until SIGTERM or SIGINT, or until its parent is gone."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    cv2.setNumThreads(1)  # arm, bus and browser keep the other cores
     stop = threading.Event()
     _on_signals(sys.exit)  # compiling kernels takes its time, and its processes end with this one
     try:
