@@ -34,7 +34,16 @@ class Logistic:
     scales: tuple[float, ...]
 
     def __call__(self, figures: FloatArray) -> FloatArray:
-        """Return the probabilities (N,) of rows of figures (N, F)."""
+        """Return the probabilities (N,) of rows of figures (N, F).
+
+        Raises:
+            ValueError: it was fitted to another number of them.
+        """
+        if self.means and figures.shape[1] != len(self.means):
+            raise ValueError(
+                f"confidences fitted to {len(self.means)} figures, asked of {figures.shape[1]}: fit"
+                " them again"
+            )
         columns = _standard(figures[:, : len(self.means)], self.means, self.scales).T
         columns = np.ascontiguousarray(columns)
         # Added up one by one: a library product may differ in the last bit with the row count.

@@ -18,8 +18,8 @@ Runs = tuple[IntArray, Int32Array, NDArray[np.float32], NDArray[np.int8]]
 
 BYTES_PER_SLOT = 40
 """Sums, levels and the path search, with room to grow: what the limit counts per slot."""
-BYTES_PER_VOXEL = 3 * BYTES_PER_SLOT
-"""The same for a voxel that may be new: blocks are about a third full."""
+MOST_SLOTS_PER_VOXEL = 3.0
+"""Blocks around thin wood are about a third full."""
 THICKEST_VOXEL_M = 0.1
 """A larger voxel holds several branches: the map could not tell them apart."""
 
@@ -248,14 +248,16 @@ class LikelihoodMap:
 
     def _check_memory(self, rows: FloatArray) -> None:
         k, starts, lengths, radii = self._config.k, rows[:, :3], rows[:, 6], rows[:, 7]
-        support = np.pi * (k * radii + 1) ** 2 * ((2 * k + 1) * lengths + 2)
+        around = k * radii + 1
+        support = np.pi * around**2 * ((2 * k + 1) * lengths + 2)
+        support *= np.minimum((1.0 + 8.0 / around) ** 2, MOST_SLOTS_PER_VOXEL)
         reach = (k + 1) * lengths.max() + k * radii.max()
         low, high = starts.min(axis=0) - reach, starts.max(axis=0) + reach
         if self.blocks.top.size:
             low = np.minimum(low, 8.0 * self.blocks.origin)
             high = np.maximum(high, 8.0 * (self.blocks.origin + self.blocks.top.shape))
         table = 4.0 * float(np.prod((high - low) / 8.0 + 2.0))
-        needed = self.blocks.slots * BYTES_PER_SLOT + float(support.sum()) * BYTES_PER_VOXEL + table
+        needed = (self.blocks.slots + float(support.sum())) * BYTES_PER_SLOT + table
         if needed > self._memory_limit_bytes:
             # Further views will add to the map: advise with room for four times as much.
             fits = self._config.voxel_size_m * (4 * needed / self._memory_limit_bytes) ** (1 / 3)

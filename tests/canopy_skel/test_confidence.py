@@ -1,6 +1,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from canopy_skel.confidence import (
     Logistic,
@@ -9,6 +10,12 @@ from canopy_skel.confidence import (
     models_to,
     shipped_models,
 )
+
+
+def test_a_model_of_other_figures_is_refused():
+    model = fit_logistic(np.eye(4), [True, False, True, False])
+    with pytest.raises(ValueError, match="fitted to 4 figures, asked of 5: fit them again"):
+        model(np.zeros((2, 5)))
 
 
 def test_a_fitted_logistic_means_what_it_says():
