@@ -26,8 +26,8 @@ _SMALLEST_TILE_PX = 512
 class UNetSegmenter:
     """Finds branches with the U-Net and groups its maps into instances.
 
-    The network sees pictures enlarged as it was trained to. One larger than a tile then is seen
-    tile by tile; where memory runs out, the tiles shrink.
+    The network sees pictures enlarged by `Model.zoom`. One larger than a tile then is seen tile by
+    tile; where memory runs out, the tiles shrink.
     """
 
     def __init__(
@@ -136,8 +136,8 @@ def masks_of(
         if box is None or scores[number - 1] < least_score:
             continue
         pixels = [
-            np.arange(floor(span.start * cell), ceil(span.stop * cell))
-            for span, cell in zip(box, cell_px, strict=True)
+            np.arange(floor(span.start * cell), min(ceil(span.stop * cell), most))
+            for span, cell, most in zip(box, cell_px, size, strict=True)
         ]
         rows, columns = ((at + 0.5) / cell for at, cell in zip(pixels, cell_px, strict=True))
         mask = strands.label[rows.astype(np.int64)[:, None], columns.astype(np.int64)] == number

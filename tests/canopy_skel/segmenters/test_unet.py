@@ -125,6 +125,19 @@ def test_without_torch_the_built_in_network_says_the_same(builtin, size):
     assert np.allclose(maps, expected, atol=1e-3)
 
 
+def test_an_instance_that_fills_the_picture_covers_all_of_any_size():
+    for size in range(1, 300):
+        grid = ceil(1.25 * size / 2)
+        strands = Strands(
+            label=np.ones((grid, grid), np.int32),
+            surplus=np.ones((grid, grid), np.float32),
+            features=np.zeros((1, len(FEATURES))),
+        )
+        (mask,) = masks_of(strands, np.ones(1), (size, size), least_score=0.0)
+        assert (mask.top_px, mask.left_px, mask.mask.shape) == (0, 0, (size, size))
+        assert mask.mask.all()
+
+
 @pytest.mark.parametrize("zoom", [0.7, 1.0, 1.25])
 def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
     height, width = 75, 111
