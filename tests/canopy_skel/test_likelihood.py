@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from oracles import naive_likelihood
 
 from canopy_skel.errors import UsageError
-from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, Segments
+from canopy_skel.likelihood import BYTES_PER_SLOT, LikelihoodConfig, LikelihoodMap, Segments
 
 VOXEL = 0.01
 
@@ -148,6 +148,18 @@ def test_a_map_that_does_not_fit_names_a_voxel_size_that_does():
     again = LikelihoodMap(LikelihoodConfig(voxel_size_m=fits), memory_limit_bytes=1 << 24)
     again.add(segments_from(rows))
     assert len(again.grid().voxels) > 0
+
+
+@pytest.mark.parametrize("radius_m", [0.02, 0.05, 0.12])
+def test_the_memory_asked_for_is_about_what_is_used_however_thick_the_wood(radius_m):
+    rows = [((0.0, 0.3 * k, 0.0), (0.1, 0.3 * k, 0.1), radius_m, 0.9) for k in range(4)]
+    settings_ = LikelihoodConfig(voxel_size_m=VOXEL)
+    free = LikelihoodMap(settings_, memory_limit_bytes=1 << 31)
+    free.add(segments_from(rows))
+    used = free.blocks.slots * BYTES_PER_SLOT
+    LikelihoodMap(settings_, memory_limit_bytes=3 * used).add(segments_from(rows))
+    with pytest.raises(UsageError, match="m fits"):
+        LikelihoodMap(settings_, memory_limit_bytes=used // 2).add(segments_from(rows))
 
 
 def test_an_empty_map_has_no_voxels():
