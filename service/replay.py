@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,9 +14,10 @@ from canopy_skel.errors import RecordingError, UsageError, ViewError
 from canopy_skel.exports import FORMATS
 from canopy_skel.exports.overlay import draw_overlay
 from canopy_skel.frame import View
-from canopy_skel.pipeline import Extraction, MethodConfig, Skeletonizer
+from canopy_skel.pipeline import Extraction, MethodConfig, Skeletonizer, models_for
 from canopy_skel.recording import Recording, TopicOptions, read_recording
 from drivers.stereo import with_depth
+from service.ahead import Ahead
 from service.outputs import write_all
 from service.segmenters import NAMES, make_segmenter
 from service.skeletons import document_of
@@ -114,24 +115,44 @@ def _walk_views(
     stopwatch: Stopwatch,
     progress: Callable[[int, int], None],
 ) -> _Walk:
-    walk = _Walk(
-        skeletonizer=Skeletonizer(
-            make_segmenter(request.segmenter, request.weights),
-            request.config,
-            stage=stopwatch,
-            memory_limit_bytes=request.memory_limit_bytes,
+    segmenter = make_segmenter(request.segmenter, request.weights)
+    method = request.config
+    maps = method.name == "canopy" and method.canopy.use_fragments
+    with Ahead(segmenter, maps=maps) as ahead:
+        walk = _Walk(
+            skeletonizer=Skeletonizer(
+                ahead,
+                method,
+                stage=stopwatch,
+                memory_limit_bytes=request.memory_limit_bytes,
+                models=models_for(segmenter),
+            )
         )
-    )
-    views = recording.views()
-    for done in range(1, recording.view_count + 1):
-        with stopwatch("read"):
-            view = next(views)
-        _add(walk, view, stopwatch)
-        progress(done, recording.view_count)
+        for done, view in enumerate(_read_ahead(recording, ahead, stopwatch), start=1):
+            _add(walk, view, stopwatch)
+            progress(done, recording.view_count)
     if not walk.skeletonizer.views:
         reason = walk.rejected[0].reason if walk.rejected else "it holds no view"
         raise RecordingError(f"{recording.path}: no view is usable; the first: {reason}")
     return walk
+
+
+def _read_ahead(
+    recording: Recording, ahead: Ahead, stopwatch: Stopwatch
+) -> Iterator[View | RejectedView]:
+    """Yield the views; each time the next one is read already, and being segmented."""
+    views = recording.views()
+    before: View | RejectedView | None = None
+    for _ in range(recording.view_count):
+        with stopwatch("read"):
+            view = next(views)
+        if isinstance(view, View):
+            ahead.expect(view)
+        if before is not None:
+            yield before
+        before = view
+    if before is not None:
+        yield before
 
 
 def _add(walk: _Walk, view: View | RejectedView, stopwatch: Stopwatch) -> None:
