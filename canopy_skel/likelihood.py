@@ -250,6 +250,7 @@ class LikelihoodMap:
         k, starts, lengths, radii = self._config.k, rows[:, :3], rows[:, 6], rows[:, 7]
         around = k * radii + 1
         support = np.pi * around**2 * ((2 * k + 1) * lengths + 2)
+        # Blocks of 8 stick out of what they cover, of thick wood by less.
         support *= np.minimum((1.0 + 8.0 / around) ** 2, MOST_SLOTS_PER_VOXEL)
         reach = (k + 1) * lengths.max() + k * radii.max()
         low, high = starts.min(axis=0) - reach, starts.max(axis=0) + reach

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Self
 
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.segment import BranchMask, Segmenter
@@ -19,7 +20,7 @@ class Ahead:
         self._worker = ThreadPoolExecutor(1, "segmenter")
         self._expected: dict[int, Future[Seen]] = {}
 
-    def __enter__(self) -> "Ahead":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -153,7 +153,7 @@ def _finished(
     model = Model(
         network=run.averaged.eval(),
         channels=run.plan.channels,
-        zoom=ZOOM,
+        zoom=ZOOM if init is None else init.zoom,
         grouping=Grouping() if init is None else init.grouping,
         calibration=UNCALIBRATED if init is None else init.calibration,
         least_score=0.5 if init is None else init.least_score,

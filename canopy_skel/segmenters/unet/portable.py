@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 
 from canopy_skel.frame import Float32Array, UInt8Array
-from canopy_skel.segmenters.unet.tiles import enlarged, tiled
+from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, tiled
 
 MODEL_FILE, DESCRIPTION_FILE = "builtin.onnx.gz", "builtin.json"
-_TILE_PX = 2048
 
 
 class PortableNetwork:
@@ -30,7 +29,7 @@ class PortableNetwork:
 
     def maps(self, color_rgb: UInt8Array) -> Float32Array:
         """Return the five maps (5, h, w) of an (H, W, 3) picture, as `UNetSegmenter.maps`."""
-        return tiled(enlarged(color_rgb, self._zoom), self._infer, _TILE_PX)
+        return tiled(enlarged(color_rgb, self._zoom), self._infer, TILE_PX)
 
     def _infer(self, color_rgb: UInt8Array) -> Float32Array:
         self._network.setInput(cv2.dnn.blobFromImage(color_rgb))

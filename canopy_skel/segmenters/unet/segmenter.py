@@ -16,10 +16,9 @@ from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.unet.grouping import Strands, grouped
 from canopy_skel.segmenters.unet.network import channels_last, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.tiles import enlarged, tiled
+from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, tiled
 from canopy_skel.segmenters.unet.weights import Model, fused
 
-TILE_PX = 2048
 _SMALLEST_TILE_PX = 512
 
 

@@ -11,6 +11,8 @@ from canopy_skel.segmenters.unet.targets import STRIDE
 
 MULTIPLE_PX = 32
 """The network wants pictures that are a multiple of this in height and width."""
+TILE_PX = 2048
+"""A picture larger than this is seen in parts."""
 MAPS = 5
 _OVERLAP_PX = 192
 
