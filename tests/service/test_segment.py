@@ -31,7 +31,7 @@ def weights(tmp_path):
     model = Model(
         network=network.eval(),
         channels=CHANNELS,
-        zoom=1.0,
+        zoom=1.5,
         grouping=Grouping(),
         calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=1.0),
         least_score=0.5,
@@ -199,7 +199,7 @@ def test_labels_judge_and_train(canopy, labelme, tmp_path, weights):
     assert "judged on: none: too few instances in scans" in stdout
     model = load(out / "unet.pt")
     assert model.channels == CHANNELS
-    assert model.least_score == 0.5
+    assert (model.least_score, model.zoom) == (0.5, 1.5)
     before = load(weights).network.state_dict()
     assert any(not torch.equal(before[k], v) for k, v in model.network.state_dict().items())
     assert len(list((out / "data" / "train").glob("*.labels.npz"))) == 2
