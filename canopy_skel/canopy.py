@@ -26,7 +26,7 @@ from canopy_skel.observe import Observation, observe
 from canopy_skel.pieces import PieceConfig
 from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
 from canopy_skel.segment import BranchMask
-from canopy_skel.slivers import inside_thicker
+from canopy_skel.slivers import inside_thicker, on_axis
 from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
@@ -162,6 +162,7 @@ class CanopyScan:
             view=view,
             fragment=fragment,
         ).chosen(probability >= limit)
+        seen = on_axis(seen)
         seen = seen.chosen(~inside_thicker(seen))
         fused = fuse(seen, self.config.fusion)
         corrections = pose_corrections(seen, fused, self.config.poses)

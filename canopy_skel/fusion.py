@@ -117,7 +117,7 @@ def _drawn(seen: Observations, config: FusionConfig) -> tuple[FloatArray, FloatA
     keys = kernel.cell_keys(seen.points_in_base, cell_m)
     order = np.argsort(keys, kind="stable")
     weight = seen.probability * np.where(seen.fragment, config.fragment_weight, 1.0)
-    seeds = _seeds(seen, weight, config.seed_m)
+    seeds = heaviest(seen.points_in_base, weight, config.seed_m)
     by_cell = np.argsort(keys[seeds], kind="stable")
     seeds = seeds[by_cell]
     references = (
@@ -221,9 +221,9 @@ def _aligned(
     return points
 
 
-def _seeds(seen: Observations, weight: FloatArray, seed_m: float) -> IntArray:
+def heaviest(points: FloatArray, weight: FloatArray, cell_m: float) -> IntArray:
     """Return the heaviest point of each cell that holds any, in the order of the points."""
-    of = kernel.cell_keys(seen.points_in_base, seed_m)
+    of = kernel.cell_keys(points, cell_m)
     order = np.lexsort((np.arange(len(of)), -weight, of))
     first = np.ones(len(of), dtype=np.bool_)
     first[1:] = np.diff(of[order]) > 0

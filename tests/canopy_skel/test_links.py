@@ -7,9 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from canopy_skel.ends import Ends, find_ends
-from canopy_skel.fusion import Observations
 from canopy_skel.links import Candidates, LinkConfig, Parts, forest_of, links_to_make, places_on
-from canopy_skel.slivers import inside_thicker
 
 
 @settings(deadline=None, max_examples=30)
@@ -68,34 +66,6 @@ def test_links_make_a_forest_that_joins_all_they_may_by_the_best(links, threshol
             directed=False,
         )
         assert part[end[i]] == part[vertex[i]]
-
-
-@pytest.mark.parametrize(
-    ("offset_m", "radius_m", "direction", "fragment", "swallowed"),
-    [
-        (0.025, 0.015, (1.0, 0, 0), False, True),
-        (0.025, 0.015, (1.0, 0, 0), True, True),
-        (0.045, 0.015, (1.0, 0, 0), False, False),  # a twig before the trunk
-        (0.025, 0.015, (0, 1.0, 0), False, False),  # a branch that leaves it
-        (0.025, 0.035, (1.0, 0, 0), False, False),  # the trunk itself, measured otherwise
-    ],
-)
-def test_strips_that_leaves_cut_off_a_trunk_are_not_wood_of_their_own(
-    offset_m, radius_m, direction, fragment, swallowed
-):
-    along = np.linspace(-0.1, 0.1, 41)
-    trunk = np.column_stack([along, 0 * along, 0 * along])
-    seen = Observations(
-        points_in_base=np.vstack([trunk, [0, offset_m, 0]]),
-        directions=np.vstack([np.tile([1.0, 0, 0], (41, 1)), direction]),
-        radius_m=np.append(np.full(41, 0.04), radius_m),
-        probability=np.ones(42),
-        view=np.zeros(42, dtype=np.int64),
-        fragment=np.append(np.zeros(41, dtype=np.bool_), fragment),
-    )
-    found = inside_thicker(seen)
-    assert not found[:-1].any()
-    assert found[-1] == swallowed
 
 
 def one_link(*, fragment=False, empty=0.0):

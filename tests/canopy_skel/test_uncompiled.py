@@ -14,6 +14,7 @@ SMALL = (
     "test_kernels.py",
     "test_neighbours.py",
     "test_pictures.py",
+    "test_slivers.py::test_bark_between_places_where_the_trunk_is_seen_whole_moves_onto_its_axis",
     "test_volume.py::test_wood_drawn_twice_counts_once",
     "test_spline.py::test_radius_is_the_papers_half_extent_along_pc2",
     "segmenters/test_labels.py::test_targets_say_where_branches_are_how_they_run_and_how_thick",
