@@ -12,7 +12,17 @@ _OF_ALL = frozenset({"blocks", "ellipsoid", "forest", "sums"})
 _OF_JOINERS = _OF_ALL | {"fit", "parts", "smooth", "strip", "trust", "unions"}
 NEEDED_BY = {
     "canopy": _OF_ALL
-    | {"agree", "aligning", "around", "candidates", "components", "fuse", "profile", "verdicts"},
+    | {
+        "agree",
+        "aligning",
+        "around",
+        "bark",
+        "candidates",
+        "components",
+        "fuse",
+        "profile",
+        "verdicts",
+    },
     "paper": _OF_JOINERS | {"joins", "search"},
     "mst": _OF_JOINERS,
     "ftsem": _OF_JOINERS,
