@@ -95,12 +95,12 @@ class LiveSkeleton:
 def warm_up(stage: Stage) -> None:
     """Load (or compile) the kernels of all methods by small skeletons: two sticks, a gap between.
 
-    The sticks are long enough for a pose to be told by them. `mst` and `ftsem` need no kernel that
-    `paper` does not.
+    The sticks are long enough for a pose to be told by them, and thick enough to have bark. `mst`
+    and `ftsem` need no kernel that `paper` does not.
     """
     size = (60, 320)
     instances = np.zeros(size, dtype=np.uint16)
-    instances[28:32, 10:140], instances[28:32, 160:310] = 1, 2
+    instances[25:35, 10:140], instances[25:35, 160:310] = 1, 2
     view = View(
         index=0,
         stamp_ns=0,
