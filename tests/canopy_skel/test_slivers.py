@@ -89,6 +89,16 @@ def test_of_several_thick_limbs_the_thickest_on_both_sides_counts():
         assert on_axis(one).points_in_base[-1] == pytest.approx([0, 0, 0], abs=1e-9)
 
 
+def test_where_the_trunk_is_seen_right_beside_the_strip_its_own_direction_counts():
+    trunk = np.repeat([-0.006, 0.006], 4)
+    seen = with_strip(trunk, [0.0, 0.035, 0.0])
+    seen.points_in_base[:8, 2] = np.tile([-0.013, -0.004, 0.004, 0.013], 2)
+    seen.points_in_base[:4, 1], seen.points_in_base[4:8, 1] = -0.006, 0.006
+    moved = on_axis(seen)
+    assert moved.points_in_base[-1] == pytest.approx([0, 0, 0], abs=1e-9)
+    assert moved.directions[-1] == pytest.approx(ALONG_X)
+
+
 def test_nothing_seen_stays_nothing():
     seen = with_strip(BELOW_AND_ABOVE, [0.0, 0.0, 0.0]).chosen(np.zeros(21, dtype=np.bool_))
     assert len(on_axis(seen).points_in_base) == 0
