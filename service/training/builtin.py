@@ -7,7 +7,7 @@ from pathlib import Path
 from canopy_skel.segmenters.labels import LabelledImage
 from mock_hw.orchard.composed.frames import FRAMES_PER_SCENE, Variety, scene_frames
 from mock_hw.orchard.presets import APPLE, OAK, WALNUT
-from service.training.store import store
+from service.training.store import StoredImages, store
 
 TRAIN = Variety(seed=20260101, species=(APPLE, OAK), clutter=1.6)
 VALIDATE = Variety(seed=20260102, species=(WALNUT,), strange=True)
@@ -22,11 +22,18 @@ class Amounts:
 
 
 def draw(folder: Path, amounts: Amounts, progress: Callable[[str, int, int], None]) -> None:
-    """Draw what is still missing of both sets into `folder`/train and `folder`/validate."""
+    """Draw what is still missing of both sets into `folder`/train and `folder`/validate.
+
+    Raises:
+        UsageError: a folder cannot be written, or another version has drawn into it.
+    """
     for name, variety, scenes in (
         ("validate", VALIDATE, amounts.validate_scenes),
         ("train", TRAIN, amounts.train_scenes),
     ):
+        drawn = StoredImages(folder / name)
+        if len(drawn):
+            drawn.maps(0)
         for scene in range(scenes):
             last = folder / name / f"{scene:05d}-{FRAMES_PER_SCENE - 1}.labels.npz"
             if not last.exists():

@@ -5,8 +5,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from canopy_skel.frame import UInt8Array
-from canopy_skel.segmenters.unet.targets import ANGLE, ANGLE_STEPS, RADIUS, RADIUS_PX, STATE, Target
+from canopy_skel.frame import Float32Array, UInt8Array
+from canopy_skel.segmenters.unet.targets import (
+    ANGLE,
+    ANGLE_STEPS,
+    RADIUS,
+    RADIUS_PX,
+    STATE,
+    Target,
+    places_of,
+)
 from service.training.store import StoredImages
 
 _ZOOM = (0.72, 1.4)
@@ -15,10 +23,15 @@ _ON_WOOD = 0.6
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Batch:
-    """color_rgb: (N, S, S, 3) uint8; maps: (N, S / 2, S / 2, 4) uint8."""
+    """Crops and what they ask of the network.
+
+    color_rgb: (N, S, S, 3) uint8. maps: (N, S / 2, S / 2, 5) uint8, see `targets_of`. places:
+    (N, S / 2, S / 2, 3), see `places_of`; pieces end where the crop does.
+    """
 
     color_rgb: UInt8Array
     maps: UInt8Array
+    places: Float32Array
 
 
 def draw_batch(
@@ -29,6 +42,7 @@ def draw_batch(
     return Batch(
         color_rgb=np.stack([color for color, _ in crops]),
         maps=np.stack([maps for _, maps in crops]),
+        places=np.stack([places_of(maps) for _, maps in crops]),
     )
 
 

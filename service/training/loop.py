@@ -29,9 +29,9 @@ class Plan:
 
     It ends after `steps` batches or after `minutes`, whichever comes first; the learning rate
     falls as a cosine over that span. centre_weight: of the middle line's part of the loss.
-    look_every: steps between validations and checkpoints. data:
-    a digest of the labels and the weights a user began with, so that a run is not gone on with on
-    others.
+    piece_weight: of where in its piece a cell lies, and how long that is. look_every: steps between
+    validations and checkpoints. data: a digest of the labels and the weights a user began with, so
+    that a run is not gone on with on others.
     """
 
     steps: int
@@ -45,6 +45,7 @@ class Plan:
     average: float = 0.999
     gradient_norm: float = 5.0
     centre_weight: float = 1.0
+    piece_weight: float = 1.0
     look_every: int = 250
     channels: tuple[int, ...] = CHANNELS
     data: str = ""
@@ -97,7 +98,7 @@ def train(
     `checkpoint.pt` (to resume from), `average-<step>.pt` and a line in `log.jsonl` at each look.
 
     Raises:
-        UsageError: there are no pictures to train on.
+        UsageError: there are no pictures to train on, or another version stored them.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)  # a second one brings next to nothing, and the core is wanted
@@ -137,15 +138,15 @@ def _advance(run: Run, pictures: StoredImages, *, fast: bool) -> None:
     run.network.train()
     with torch.autocast("cpu", torch.bfloat16, enabled=fast):
         output = run.network(normalised(batch.color_rgb))
-    loss = loss_of(maps_of(output), torch.from_numpy(batch.maps))
-    total = loss.total(plan.centre_weight)
+    loss = loss_of(maps_of(output), torch.from_numpy(batch.maps), torch.from_numpy(batch.places))
+    total = loss.total(plan.centre_weight, plan.piece_weight)
     run.optimiser.zero_grad(set_to_none=True)
     total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     torch.nn.utils.clip_grad_norm_(run.network.parameters(), plan.gradient_norm)
     run.optimiser.step()
     run.step += 1
     _average(run)
-    for name in ("branch", "centre", "direction", "radius"):
+    for name in ("branch", "centre", "direction", "radius", "middle", "length"):
         value = float(getattr(loss, name).detach())
         run.losses[name] = 0.98 * run.losses.get(name, value) + 0.02 * value
     run.seconds += time.perf_counter() - clock

@@ -9,7 +9,7 @@ import numpy as np
 from canopy_skel.errors import UsageError
 from canopy_skel.frame import UInt8Array
 from canopy_skel.segmenters.labels import LabelledImage
-from canopy_skel.segmenters.unet.targets import targets_of
+from canopy_skel.segmenters.unet.targets import TARGETS, targets_of
 
 
 class StoredImages:
@@ -41,8 +41,17 @@ class StoredImages:
         return color
 
     def maps(self, index: int) -> UInt8Array:
-        """Return the (H / 2, W / 2, 4) target maps, mapped from disk."""
+        """Return the (H / 2, W / 2, 5) target maps, mapped from disk.
+
+        Raises:
+            UsageError: another version stored them, for a network with other maps.
+        """
         maps: UInt8Array = np.load(self._folder / f"{self.names[index]}.maps.npy", mmap_mode="r")
+        if maps.shape[2:] != (TARGETS,):
+            raise UsageError(
+                f"{self._folder}: holds pictures that another version has stored; give another"
+                " folder, or delete this one to have them drawn anew"
+            )
         return maps
 
 

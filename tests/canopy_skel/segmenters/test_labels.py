@@ -9,10 +9,13 @@ from canopy_skel.segmenters.unet.targets import (
     ANGLE,
     ANGLE_STEPS,
     CENTRE,
+    PIECE,
     RADIUS,
     RADIUS_PX,
     STATE,
+    STRIDE,
     Target,
+    places_of,
     targets_of,
 )
 
@@ -80,3 +83,66 @@ def test_the_direction_follows_a_bend():
     degrees = maps[..., ANGLE] * (180 / ANGLE_STEPS)
     assert degrees[30, 50] == pytest.approx(0, abs=1)
     assert degrees[80, 80] == pytest.approx(90, abs=1)
+
+
+def test_cells_say_which_piece_they_are_of():
+    image = drawn([straight((80, 60), 20, 90, 4), straight((200, 160), 110, 120, 7)])
+    maps = targets_of(image)
+    assert np.array_equal(maps[..., PIECE] > 0, maps[..., STATE] == Target.BRANCH)
+    assert maps[30, 40, PIECE] == 1
+    assert maps[80, 100, PIECE] == 2
+
+
+def test_numbers_of_pieces_begin_again_after_255():
+    corners = [(u, v) for v in range(8, 240, 16) for u in range(8, 320, 16)]
+    maps = targets_of(drawn([straight(corner, 0, 10, 3) for corner in corners]))
+    numbers = [maps[v // 2, u // 2, PIECE] for u, v in corners]
+    assert numbers == [*range(1, 256), *range(1, len(corners) - 254)]
+
+
+def on_strip(maps, angle):
+    """Of the cells of a strip: how far along it, and the way to its middle along and across."""
+    v, u = np.nonzero(maps[..., PIECE])
+    middle_u, middle_v, log_length = places_of(maps)[v, u].T
+    cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    way = cosine * middle_u + sine * middle_v
+    return cosine * u + sine * v, way, cosine * middle_v - sine * middle_u, np.exp(log_length)
+
+
+@given(
+    angle=st.floats(0, 180),
+    length=st.floats(60, 180),
+    radius=st.floats(3, 9),
+    kept=st.floats(0.3, 1),
+)
+def test_cells_of_a_strip_say_where_its_middle_is_and_how_long_it_is(angle, length, radius, kept):
+    maps = targets_of(drawn([straight((160, 120), angle, length, radius)]))
+    along, way, across, found = on_strip(maps, angle)
+    cell = 2 * STRIDE / length
+    assert found == pytest.approx(length, abs=2 * STRIDE)
+    middle = (np.cos(np.radians(angle)) * 160 + np.sin(np.radians(angle)) * 120) / STRIDE
+    assert way == pytest.approx((middle - along) * cell, abs=1.5 * cell)
+    assert np.abs(across).max() < 0.03
+    assert [way.max(), way.min()] == pytest.approx([1, -1], abs=cell)
+
+    # What a crop leaves of it is a piece of its own.
+    v, u = np.nonzero(maps[..., PIECE])
+    if np.ptp(u) > np.ptp(v):
+        crop = maps[:, : u.min() + int(kept * np.ptp(u)) + 1]
+    else:
+        crop = maps[v.max() - int(kept * np.ptp(v)) :]
+    along, way, _, found = on_strip(crop, angle)
+    seen = np.ptp(along) + 1
+    assert found == pytest.approx(STRIDE * seen, rel=0.02)
+    assert way == pytest.approx((along.min() + along.max() - 2 * along) / seen, abs=0.03)
+
+
+def test_each_of_two_pieces_has_a_middle_of_its_own():
+    one, other = straight((80, 60), 20, 90, 4), straight((200, 160), 110, 120, 7)
+    both = places_of(targets_of(drawn([one, other])))
+    apart = [places_of(targets_of(drawn([line]))) for line in (one, other)]
+    assert both == pytest.approx(apart[0] + apart[1])
+
+
+def test_without_branches_nothing_has_a_place():
+    assert not places_of(targets_of(drawn([]))).any()
