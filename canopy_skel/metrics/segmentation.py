@@ -128,6 +128,19 @@ def judge(
     )
 
 
+def best_overlaps(found: Sequence[BranchMask], truth: LabelledImage) -> FloatArray:
+    """Return what each mask has in common, by middle line, with the label it is most like, (N,).
+
+    NaN where most of a mask is to be ignored and no label is its own.
+    """
+    _, size, _, ignored = _pixels_of(found, truth)
+    numbers = np.unique(truth.instances[truth.instances > 0]).astype(np.int64)
+    lines = [MiddleLine.of(_line_of(mask)) for mask in found]
+    true_lines = [MiddleLine.of(truth.lines[number - 1]) for number in numbers.tolist()]
+    best = overlaps(lines, true_lines).max(axis=1, initial=0.0)
+    return np.asarray(np.where((ignored > _IGNORED * size) & (best <= LEAST_OVERLAP), np.nan, best))
+
+
 def matched(likeness: FloatArray, least: float) -> BoolArray:
     """Say which rows (N,), first come first served, get a column of (N, M) all to themselves.
 
@@ -145,7 +158,7 @@ def matched(likeness: FloatArray, least: float) -> BoolArray:
 
 
 def _pixels_of(
-    masks: list[BranchMask], truth: LabelledImage
+    masks: Sequence[BranchMask], truth: LabelledImage
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Return pixels (N, 1 + M) by true instance (0: none), in all, not ignored, and ignored."""
     width = int(truth.instances.max(initial=0)) + 1

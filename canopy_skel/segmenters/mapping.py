@@ -13,7 +13,7 @@ class MappingSegmenter(Protocol):
     """A segmenter that has maps as well."""
 
     def segment_and_map(self, view: View) -> tuple[Sequence[BranchMask], Float32Array]:
-        """Return what `segment` returns, and the maps (5, h, w) of the network."""
+        """Return what `segment` returns, and the maps (8, h, w) of the network."""
         ...
 
 

@@ -1,99 +1,90 @@
 """How good weights are on labelled pictures, and how their scores are made honest."""
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, logit
 
-from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray
-from canopy_skel.metrics.segmentation import (
-    Judgement,
-    SegmentationScores,
-    judge,
-    segmentation_scores,
-)
+from canopy_skel.metrics.segmentation import Judgement, judge
 from canopy_skel.segmenters.labels import LabelledImage
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping, grouped
-from canopy_skel.segmenters.unet.segmenter import masks_of
+from canopy_skel.segmenters.unet.scorer import Scorer
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, instances_of
+from canopy_skel.segmenters.unet.weights import Model
 
 _RIDGE = 1e-3
+_SUREST = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
-class Sighting:
-    """What was found in one picture, however low its score.
+class Correction(NamedTuple):
+    """Of scores, on their logits."""
 
-    features: (N, F) of the instances of `judgement`.
-    """
+    slope: float
+    shift: float
 
-    judgement: Judgement
-    features: FloatArray
-
-
-def sight(
-    maps: Float32Array,
-    image: LabelledImage,
-    grouping: Grouping,
-    calibration: Calibration,
-    least_score: float,
-) -> Sighting:
-    """Group the maps of a picture and compare what comes of it with the labels."""
-    strands = grouped(maps, grouping)
-    scores = calibration.scores(strands.features)
-    size = image.ignore.shape[0], image.ignore.shape[1]
-    masks = masks_of(strands, scores, size, least_score=0.0)
-    own = np.array([mask.instance - 1 for mask in masks], dtype=np.int64)
-    judgement = judge(masks, image, threshold=least_score)
-    return Sighting(judgement=judgement, features=strands.features[own[judgement.place]])
+    def of(self, confidence: FloatArray) -> FloatArray:
+        """Return corrected scores."""
+        logits = logit(np.clip(confidence, _SUREST, 1 - _SUREST))
+        return np.asarray(expit(self.slope * logits + self.shift))
 
 
-def figures(sightings: Sequence[Sighting]) -> SegmentationScores:
-    """Return the figures of merit over all pictures."""
-    return segmentation_scores([sighting.judgement for sighting in sightings])
-
-
-def rescored(sightings: Sequence[Sighting], calibration: Calibration) -> list[Sighting]:
-    """Return sightings with other scores; what was matched with what stays."""
+def judgements_of(model: Model, pictures: Sequence[LabelledImage]) -> list[Judgement]:
+    """Compare what a model finds, however low its score, with the labels."""
+    segmenter, every = UNetSegmenter(model), replace(model, least_score=0.0)
     return [
-        replace(s, judgement=replace(s.judgement, confidence=calibration.scores(s.features)))
-        for s in sightings
+        judge(
+            instances_of(segmenter.known(picture.color_rgb), picture.ignore.shape[:2], every),
+            picture,
+            threshold=model.least_score,
+        )
+        for picture in pictures
     ]
 
 
-def calibrated(sightings: Sequence[Sighting]) -> Calibration:
-    """Return the logistic regression of being matched on the features (ridge, standardised).
+def corrected(judgements: Sequence[Judgement], correction: Correction) -> list[Judgement]:
+    """Return judgements with corrected scores; what was matched with what stays."""
+    return [replace(one, confidence=correction.of(one.confidence)) for one in judgements]
 
-    Where nothing was found, it says one half of everything.
+
+def honest(judgements: Sequence[Judgement]) -> Correction:
+    """Return the correction that makes scores the chance to be matched (Platt's; ridge).
+
+    Without any instance it changes nothing.
     """
-    x = np.concatenate([s.features for s in sightings])
-    if not len(x):
-        return Calibration(weights=(0.0,) * x.shape[1], bias=0.0)
-    y = np.concatenate([s.judgement.at_line for s in sightings]).astype(np.float64)
-    middle, spread = x.mean(axis=0), x.std(axis=0) + 1e-9
-    z = (x - middle) / spread
+    found = np.concatenate([one.confidence for one in judgements])
+    if not len(found):
+        return Correction(slope=1.0, shift=0.0)
+    x = logit(np.clip(found, _SUREST, 1 - _SUREST))
+    y = np.concatenate([one.at_line for one in judgements]).astype(np.float64)
 
     def cost(parameters: FloatArray) -> tuple[float, FloatArray]:
-        logit = z @ parameters[:-1] + parameters[-1]
-        value = np.mean(np.logaddexp(0, logit) - y * logit)
-        residual = (expit(logit) - y) / len(y)
-        slope = np.concatenate([z.T @ residual, [residual.sum()]])
-        slope[:-1] += 2 * _RIDGE * parameters[:-1]
-        return float(value + _RIDGE * np.sum(parameters[:-1] ** 2)), slope
+        slope, shift = parameters
+        z = slope * x + shift
+        residual = (expit(z) - y) / len(y)
+        value = np.mean(np.logaddexp(0, z) - y * z) + _RIDGE * ((slope - 1) ** 2 + shift**2)
+        gradient = [residual @ x + 2 * _RIDGE * (slope - 1), residual.sum() + 2 * _RIDGE * shift]
+        return float(value), np.array(gradient)
 
-    best = minimize(cost, np.zeros(x.shape[1] + 1), jac=True, method="L-BFGS-B").x
-    weights = best[:-1] / spread
-    return Calibration(
-        weights=tuple(float(w) for w in weights), bias=float(best[-1] - weights @ middle)
-    )
+    slope, shift = minimize(cost, np.array([1.0, 0.0]), jac=True, method="L-BFGS-B").x
+    return Correction(slope=float(slope), shift=float(shift))
 
 
-def threshold(sightings: Sequence[Sighting], precision: float) -> float:
+def corrected_scorer(scorer: Scorer, correction: Correction) -> Scorer:
+    """Return a scorer whose scores are corrected."""
+    result = copy.deepcopy(scorer)
+    result.slope.mul_(correction.slope)
+    result.shift.mul_(correction.slope).add_(correction.shift)
+    return result
+
+
+def threshold(judgements: Sequence[Judgement], precision: float) -> float:
     """Return the lowest score from which on as large a share is wood, in steps of 0.01."""
-    scores = np.concatenate([s.judgement.confidence for s in sightings])
-    on_wood = np.concatenate([s.judgement.on_wood for s in sightings])
+    scores = np.concatenate([one.confidence for one in judgements])
+    on_wood = np.concatenate([one.on_wood for one in judgements])
     for least in np.arange(0.05, 0.96, 0.01):
         sure = scores >= least
         if not sure.any() or on_wood[sure].mean() >= precision:

@@ -13,10 +13,10 @@ from torch import Tensor
 from canopy_skel.errors import UsageError
 from canopy_skel.segmenters.labels import LabelledImage
 from canopy_skel.segmenters.unet.grouping import Grouping
-from canopy_skel.segmenters.unet.weights import UNCALIBRATED, Model, save
+from canopy_skel.segmenters.unet.weights import Model, save
 from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
-from service.training.recipe import ZOOM, Halves, finish
+from service.training.recipe import ZOOM, Halves, finish, with_scorer
 from service.training.store import StoredImages, store
 from service.training.user_pictures import UserPicture, labelled, split
 
@@ -123,7 +123,9 @@ def user_weights(
     shown = validate if len(validate) else train_set
     look = Look(shown, range(min(len(shown), 20)), ZOOM)
     train(run, lambda: train_set, folder / "run", look)
-    model, facts = _finished(run, folder / "run", [validate[k] for k in range(len(validate))], init)
+    lessons = [train_set[k] for k in range(len(train_set))]
+    judged = [validate[k] for k in range(len(validate))]
+    model, facts = _finished(run, folder / "run", lessons, judged, init)
     facts["training"] |= {"pictures": len(train_set), "scans": imported.scans}
     save(output, model, facts)
     return imported, facts
@@ -140,24 +142,25 @@ def _digest(labels: Path, state: Mapping[str, Tensor] | None) -> str:
 
 
 def _finished(
-    run: Run, folder: Path, validate: Sequence[LabelledImage], init: Model | None
+    run: Run,
+    folder: Path,
+    lessons: Sequence[LabelledImage],
+    validate: Sequence[LabelledImage],
+    init: Model | None,
 ) -> tuple[Model, dict[str, Any]]:
-    """Choose, calibrate and measure on validation pictures; keep to `init` where they are few."""
+    """Teach the scorer, calibrate and measure; keep to what `init` reports where little is left."""
+    scorer = None if init is None else init.scorer
     if sum(len(image.lines) for image in validate) >= ENOUGH_INSTANCES:
-        model, facts = finish(run, folder, Halves(choose=validate, report=validate))
+        halves = Halves(choose=validate, report=validate)
+        model, facts = finish(run, folder, lessons, scorer, halves)
         facts["validation"]["kind"] = (
             "the user's pictures of scans not trained on; threshold and calibration were set on"
             " them too, so expect a little less elsewhere"
         )
         return model, facts
-    model = Model(
-        network=run.averaged.eval(),
-        channels=run.plan.channels,
-        zoom=ZOOM if init is None else init.zoom,
-        grouping=Grouping() if init is None else init.grouping,
-        calibration=UNCALIBRATED if init is None else init.calibration,
-        least_score=0.5 if init is None else init.least_score,
-    )
+    zoom, grouping = (ZOOM, Grouping()) if init is None else (init.zoom, init.grouping)
+    model = with_scorer(run.averaged, run.step, lessons, scorer, zoom, grouping)
+    model = replace(model, least_score=0.5 if init is None else init.least_score)
     kind = "none: too few instances in scans that were not trained on"
     training = {"plan": run.plan.fields(), "steps": run.step, "torch": torch.__version__}
     return model, {"validation": {"kind": kind, "reported": {}}, "training": training}

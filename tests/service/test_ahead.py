@@ -49,5 +49,5 @@ def test_maps_come_where_they_are_wanted():
     with Ahead(Watched(), maps=True) as ahead:
         masks, maps = ahead.segment_and_map(view_from(1))
     assert len(masks) == 3
-    assert maps.shape == (5, 150, 200)
+    assert maps.shape == (8, 150, 200)
     assert maps.dtype == np.float32

@@ -8,11 +8,11 @@ import pytest
 import torch
 from mcap.reader import make_reader
 from scenes.drawn import drawn, straight
+from scenes.scorers import constant_scorer
 from scenes.wood import view_from
 
 from canopy_skel.recording import RecordingWriter, read_recording
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.weights import Model, load, save
 
@@ -27,13 +27,13 @@ def weights(tmp_path):
     network = UNet(CHANNELS)
     torch.nn.init.zeros_(network.head.weight)
     with torch.no_grad():
-        network.head.bias.copy_(torch.tensor([3.0, 3.0, 1.0, 0.0, 2.0]))
+        network.head.bias.copy_(torch.tensor([3.0, 3.0, 1.0, 0.0, 2.0, 0.0, 0.0, 5.0]))
     model = Model(
         network=network.eval(),
         channels=CHANNELS,
         zoom=1.5,
         grouping=Grouping(),
-        calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=1.0),
+        scorer=constant_scorer(CHANNELS, 1.0),
         least_score=0.5,
     )
     save(tmp_path / "small.pt", model, {})

@@ -1,19 +1,19 @@
-"""From the network's maps to instances: slender, straight, disjoint (no boxes, no suppression).
+"""From the network's maps to instances: slender, straight, disjoint (no boxes).
 
 The middle lines of neighbouring branches lie apart even where their masks touch: the
 middle-line map is thinned, chained along the direction field, cut where it bends, and grown to
-full width.
+full width. Done at several thresholds of that map, it parts what is seen in several ways; what a
+`scorer.Scorer` is surest of is taken first.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
 
 from canopy_skel.frame import Float32Array
-from canopy_skel.geometry import FloatArray
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels import strands
-from canopy_skel.segmenters.unet.features import measured
 from canopy_skel.segmenters.unet.joining import joined
 from canopy_skel.segmenters.unet.targets import STRIDE
 
@@ -25,16 +25,17 @@ _SLENDER = 1.2
 class Grouping:
     """How maps become instances; lengths in pixels of the picture.
 
-    branch, centre: least probability of a cell on a branch, on a middle line. outline: that of a
+    branch: least probability of a cell on a branch. centres: of one on a middle line, one for each
+    way of parting what is seen. outline: that of a
     pixel in the finished mask; what is only likely would make wood thick (a third of the choosing
     pictures: twigs 20 % too thick at .4, 6 % at .75, at the price of line-AP). gate_deg: largest
     turn, ratio: largest logarithmic step of the radius from cell to cell. bend_*: a strand is cut
     where it leaves its chord by more than each of these. reach: how many radii it grows from its
-    middle.
+    middle. taken: the largest share of a strand that surer ones may have taken of it.
     """
 
     branch: float = 0.4
-    centre: float = 0.15
+    centres: tuple[float, ...] = (0.02, 0.05, 0.15, 0.4, 0.65)
     outline: float = 0.6
     gate_deg: float = 14.0
     ratio: float = 0.6
@@ -44,6 +45,20 @@ class Grouping:
     reach: float = 1.15
     least_pixels: int = 100
     least_length_px: float = 20.0
+    taken: float = 0.4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Candidates:
+    """Strands that may be branches, N of them, on the network's grid; they overlap.
+
+    size: (h, w) of the grid. cells: of each, its places in the flattened grid, ascending. way:
+    (N,) which of `Grouping.centres` it comes from; those of one are disjoint.
+    """
+
+    size: tuple[int, int]
+    cells: tuple[strands.I64, ...]
+    way: IntArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -51,23 +66,66 @@ class Strands:
     """Instances on the network's grid.
 
     label: (h, w) int32, 0 = none. surplus: (h, w), how far the branch logit is above the outline's.
-    features: (N, F) of instance i at i - 1, see `features`.
     """
 
     label: strands.I32
     surplus: Float32Array
-    features: FloatArray
 
 
-def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
-    """Group (5, h, w) maps: logits of branch and centre, cos 2θ, sin 2θ, log radius in pixels."""
-    log_cell = np.float32(np.log(STRIDE))
+def candidates_of(maps: Float32Array, grouping: Grouping) -> Candidates:
+    """Group (8, h, w) maps in several ways; what comes out twice counts once."""
     inside = maps[0] > _logit(grouping.branch)
-    smooth = np.zeros_like(maps[1:])
-    strands.smoothed(inside, maps[1:], smooth)
+    smooth = np.zeros((4, *inside.shape), dtype=np.float32)
+    strands.smoothed(inside, maps[1:5], smooth)
     centre, field = smooth[0], smooth[1:]
-    field[2] -= log_cell
-    core = inside & (centre > _logit(grouping.centre))
+    field[2] -= np.float32(np.log(STRIDE))
+    cells: list[strands.I64] = []
+    ways: list[int] = []
+    known: set[bytes] = set()
+    for way, least in enumerate(grouping.centres):
+        core = inside & (centre > _logit(least))
+        for own in _strands(core, inside, field, grouping):
+            name = own.tobytes()
+            if name not in known:
+                known.add(name)
+                cells.append(own)
+                ways.append(way)
+    height, width = inside.shape
+    return Candidates(size=(height, width), cells=tuple(cells), way=np.array(ways, dtype=np.int64))
+
+
+def chosen(
+    maps: Float32Array, candidates: Candidates, scores: FloatArray, grouping: Grouping
+) -> tuple[Strands, FloatArray]:
+    """Return what candidates come to, the surest first, and the score of instance i at i - 1.
+
+    One that surer ones have taken too much of is dropped; else it keeps what is left.
+    """
+    label = np.zeros(maps[0].size, dtype=np.int32)
+    taken: list[float] = []
+    for place in np.argsort(-scores, kind="stable").tolist():
+        cells = candidates.cells[place]
+        free = cells[label[cells] == 0]
+        if len(free) < (1 - grouping.taken) * len(cells):
+            continue
+        taken.append(float(scores[place]))
+        label[free] = len(taken)
+    strands_ = Strands(label=label.reshape(candidates.size), surplus=surplus_of(maps, grouping))
+    return strands_, np.array(taken)
+
+
+def surplus_of(maps: Float32Array, grouping: Grouping) -> Float32Array:
+    """Return how far the branch logit is above the outline's, (h, w)."""
+    return np.asarray(maps[0] - np.float32(_logit(grouping.outline)), dtype=np.float32)
+
+
+def _strands(
+    core: BoolArray, inside: BoolArray, field: Float32Array, grouping: Grouping
+) -> list[strands.I64]:
+    """Return the cells of strands that a core (h, w) of middle lines parts `inside` into.
+
+    field: (3, h, w) cos 2θ, sin 2θ, log radius in cells.
+    """
     core[[0, -1]], core[:, [0, -1]] = False, False
     cells = strands.thinned(core)
     number = np.full(inside.shape, -1, dtype=np.int32)
@@ -84,35 +142,32 @@ def grouped(maps: Float32Array, grouping: Grouping) -> Strands:
     label = np.empty(inside.shape, dtype=np.int32)
     together = np.concatenate([np.empty((0, 2), np.int32), *paths])
     count = strands.painted(together, np.stack([ends[:-1], ends[1:]], axis=1), field[2], label)
-    middle = label.copy()
     strands.grown(label, inside, field[2], grouping.reach)
-    measures = measured(label, middle, count, maps, field[2])
-    wanted = measures.pixels >= grouping.least_pixels
-    wanted &= measures.length_px >= grouping.least_length_px
-    wanted &= measures.length_px**2 > _SLENDER * measures.pixels
-    kept = np.zeros(count + 1, dtype=np.int32)
-    kept[1:][wanted] = np.arange(1, int(wanted.sum()) + 1)
-    return Strands(
-        label=kept[label],
-        surplus=maps[0] - np.float32(_logit(grouping.outline)),
-        features=measures.features[wanted],
-    )
+    place = np.flatnonzero(label)
+    own = label.ravel()[place] - 1
+    ends = np.cumsum([0, *np.bincount(own, minlength=count)])
+    place = place[np.argsort(own, kind="stable")]
+    width = inside.shape[1]
+    parts = [place[begin:end] for begin, end in itertools.pairwise(ends)]
+    wanted = _slender(place // width, place % width, ends, grouping)
+    return [part for part, good in zip(parts, wanted, strict=True) if good]
+
+
+def _slender(rows: IntArray, columns: IntArray, ends: IntArray, grouping: Grouping) -> BoolArray:
+    """Say which groups of cells, from one of `ends` to the next, are long and slender enough."""
+    cells = np.diff(ends)
+    own = np.repeat(np.arange(len(cells)), cells)
+
+    def mean(values: FloatArray | IntArray) -> FloatArray:
+        return np.bincount(own, values, len(cells)) / np.maximum(cells, 1)
+
+    u, v = columns - mean(columns)[own], rows - mean(rows)[own]
+    uu, vv, uv = mean(u * u), mean(v * v), mean(u * v)
+    along = 0.5 * (uu + vv) + np.sqrt(0.25 * (uu - vv) ** 2 + uv**2)
+    length_px, pixels = STRIDE * np.sqrt(12 * along + 1), STRIDE**2 * cells
+    long = (pixels >= grouping.least_pixels) & (length_px >= grouping.least_length_px)
+    return np.asarray(long & (length_px**2 > _SLENDER * pixels))
 
 
 def _logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Calibration:
-    """From features to the probability that an instance is a branch: a logistic regression.
-
-    weights: one per name of `features.FEATURES`.
-    """
-
-    weights: tuple[float, ...]
-    bias: float
-
-    def scores(self, features: FloatArray) -> FloatArray:
-        """Return (N,) scores in (0, 1)."""
-        return np.asarray(expit(features @ np.array(self.weights) + self.bias))

@@ -63,28 +63,35 @@ def joined(paths: list[I32], field: Float32Array, rule: F64) -> list[I32]:
 
 
 def _ends_of(paths: list[I32], field: Float32Array) -> _Ends:
-    place, tangent, radius = [], [], []
-    for path in paths:
-        log_radius = field[2, path[:, 0], path[:, 1]].mean()
-        for own in (path, path[::-1]):
-            place.append(own[0].astype(np.float64))
-            tangent.append(_outwards(own[:_TANGENT_CELLS], field))
-            radius.append(log_radius)
+    ways = [own for path in paths for own in (path, path[::-1])]
+    cosine, sine = _means(field[:2], [way[:_TANGENT_CELLS] for way in ways])
+    (log_radius,) = _means(field[2:3], paths)
+    place = np.array([way[0] for way in ways], dtype=np.float64)
+    inner = np.array([way[min(_WAY_CELLS, len(way) - 1)] for way in ways])
     return _Ends(
-        place=np.array(place), tangent=np.array(tangent), log_radius=np.array(radius, np.float64)
+        place=place,
+        tangent=_outwards(cosine, sine, place - inner),
+        log_radius=np.repeat(log_radius, 2),
     )
 
 
-def _outwards(cells: I32, field: Float32Array) -> FloatArray:
-    """Return the direction (row, column) in which the field leaves by the first of some cells.
+def _means(field: Float32Array, groups: list[I32]) -> FloatArray:
+    """Return the means (K, N) of maps (K, h, w) over N groups of cells."""
+    row, column = np.concatenate(groups).T
+    counts = np.array([len(group) for group in groups])
+    sums = np.add.reduceat(field[:, row, column], np.cumsum(counts) - counts, axis=1)
+    return np.asarray(sums / counts)
+
+
+def _outwards(cosine: FloatArray, sine: FloatArray, way: FloatArray) -> FloatArray:
+    """Return the directions (N, 2: row, column) of the field that go the given way (N, 2) at all.
 
     The field is steadier than the line: thinning bends its ends.
     """
-    cosine, sine = field[:2, cells[:, 0], cells[:, 1]].mean(axis=1)
     angle = 0.5 * np.arctan2(sine, cosine)
-    way = np.array([np.sin(angle), np.cos(angle)])
-    inner = cells[min(_WAY_CELLS, len(cells) - 1)]
-    return -way if way @ (cells[0] - inner) < 0 else way
+    tangent = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    back = (tangent * way).sum(axis=1) < 0
+    return np.where(back[:, None], -tangent, tangent)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

@@ -1,6 +1,7 @@
 """The network: a small U-Net whose highest level works at a quarter of the picture's size.
 
-Five maps at half size: branch, middle line (both logits), cos 2θ, sin 2θ, log radius.
+Eight maps at half size: branch, middle line (both logits), cos 2θ, sin 2θ, log radius; and of the
+piece a pixel lies on, the way to its middle and its log length.
 """
 
 import itertools
@@ -16,13 +17,16 @@ from canopy_skel.frame import UInt8Array
 CHANNELS = (16, 32, 64, 128, 192)
 """At 1/2, 1/4, 1/8, 1/16 and 1/32 of the picture's size: 1.8 million parameters."""
 _MEAN, _SCALE = 0.45, 0.25
+_GAIN, _OFFSET = 1 / (255.0 * _SCALE), _MEAN / _SCALE
 
 
 class Maps(NamedTuple):
     """What the network says of every second pixel, each (N, H / 2, W / 2).
 
     branch, centre: logits. cosine, sine: of twice the direction's angle (u right, v down).
-    log_radius: natural logarithm of the radius in pixels.
+    log_radius: natural logarithm of the radius in pixels. middle_u, middle_v: the way to the middle
+    of the piece, along it, in its half lengths: 1 long at its ends, 0 in its middle. log_length:
+    natural logarithm of the piece's length in pixels.
     """
 
     branch: Tensor
@@ -30,6 +34,9 @@ class Maps(NamedTuple):
     cosine: Tensor
     sine: Tensor
     log_radius: Tensor
+    middle_u: Tensor
+    middle_v: Tensor
+    log_length: Tensor
 
 
 class _Residual(nn.Module):
@@ -67,7 +74,17 @@ class UNet(nn.Module):
         self.head = nn.Conv2d(channels[0], len(Maps._fields), 1)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Return (N, 5, H / 2, W / 2) of `normalised` (N, 3, H, W) pictures; see `Maps`."""
+        """Return (N, 8, H / 2, W / 2) of `normalised` (N, 3, H, W) pictures; see `Maps`."""
+        maps: Tensor = self.head(self.features(pictures))
+        return maps
+
+    def known(self, pictures: Tensor) -> Tensor:
+        """Return the maps of `forward`, and after them the features they are made of."""
+        features = self.features(pictures)
+        return torch.cat([self.head(features), features], dim=1)
+
+    def features(self, pictures: Tensor) -> Tensor:
+        """Return (N, channels[0], H / 2, W / 2) of `normalised` (N, 3, H, W) pictures."""
         x = self.stem(pictures)
         skips = [x]
         for down, encode in zip(self.down, self.encode, strict=True):
@@ -76,8 +93,8 @@ class UNet(nn.Module):
         for level in reversed(range(len(self.narrow))):
             up = functional.interpolate(self.narrow[level](x), scale_factor=2.0, mode="nearest")
             x = self.decode[level](up + skips[level])
-        result: Tensor = self.head(x)
-        return result
+        features: Tensor = x
+        return features
 
 
 def channels_last(network: UNet) -> UNet:
@@ -89,15 +106,16 @@ def channels_last(network: UNet) -> UNet:
 
 
 def maps_of(output: Tensor) -> Maps:
-    """Split the network's (N, 5, h, w) output."""
+    """Split the network's (N, 8, h, w) output."""
     return Maps(*output.float().unbind(dim=1))
 
 
 def normalised(pictures_rgb: UInt8Array) -> Tensor:
     """Return (N, 3, H, W) float32, channels last, of (N, H, W, 3) uint8 pictures."""
-    return scaled(torch.from_numpy(pictures_rgb).permute(0, 3, 1, 2).float())
+    pictures = torch.from_numpy(pictures_rgb).permute(0, 3, 1, 2).float()
+    return pictures.mul_(_GAIN).sub_(_OFFSET)
 
 
 def scaled(pictures_rgb: Tensor) -> Tensor:
     """Return (N, 3, H, W) pictures of 0 to 255 as the network wants them."""
-    return (pictures_rgb / 255.0 - _MEAN) / _SCALE
+    return pictures_rgb * _GAIN - _OFFSET

@@ -1,4 +1,4 @@
-"""The network for runtimes that do not have torch: ONNX, pictures in, the five maps out."""
+"""The network for runtimes that do not have torch: ONNX, pictures in, the eight maps out."""
 
 import gzip
 import io
@@ -34,7 +34,7 @@ def export_onnx(model: Model, path: Path) -> None:
     """Write the network as ONNX, opset 17, batch, height and width free; packed if named .gz.
 
     Input `pictures_rgb`: (N, 3, H, W) float32, 0 to 255, H and W multiples of 32 (continue the
-    edge), enlarged as `Model.zoom` says. Output `maps`: (N, 5, H / 2, W / 2), see `network.Maps`;
+    edge), enlarged as `Model.zoom` says. Output `maps`: (N, 8, H / 2, W / 2), see `network.Maps`;
     what groups them into instances is not part of it. Normalisations are left as they are, for the
     runtime to fold in: so the weights keep to what half precision holds, and pack well.
 

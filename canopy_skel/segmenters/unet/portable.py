@@ -28,7 +28,7 @@ class PortableNetwork:
         self._zoom = float(json.loads((folder / DESCRIPTION_FILE).read_text())["zoom"])
 
     def maps(self, color_rgb: UInt8Array) -> Float32Array:
-        """Return the five maps (5, h, w) of an (H, W, 3) picture, as `UNetSegmenter.maps`."""
+        """Return the eight maps (8, h, w) of an (H, W, 3) picture, see `network.Maps`."""
         return tiled(enlarged(color_rgb, self._zoom), self._infer, TILE_PX)
 
     def _infer(self, color_rgb: UInt8Array) -> Float32Array:

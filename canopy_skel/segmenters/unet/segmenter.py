@@ -13,8 +13,8 @@ from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.segment import BranchMask
-from canopy_skel.segmenters.unet.grouping import Strands, grouped
-from canopy_skel.segmenters.unet.network import channels_last, normalised
+from canopy_skel.segmenters.unet.grouping import Strands, candidates_of, chosen
+from canopy_skel.segmenters.unet.network import Maps, channels_last, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, tiled
 from canopy_skel.segmenters.unet.weights import Model, fused
@@ -65,7 +65,7 @@ class UNetSegmenter:
         return self.segment_and_map(view)[0]
 
     def segment_and_map(self, view: View) -> tuple[Sequence[BranchMask], Float32Array]:
-        """Return what `segment` does, and the maps (5, h, w) it rests on.
+        """Return what `segment` does, and the maps (8, h, w) it rests on, see `network.Maps`.
 
         Raises: as `segment`.
         """
@@ -76,18 +76,20 @@ class UNetSegmenter:
                 " unet segmenter needs (H, W, 3) uint8"
             )
         try:
-            maps = self.maps(color)
+            known = self.known(color)
         except MemoryError as error:
             raise ViewError(
                 f"view {view.index}: no memory left for a picture of {color.shape[1]}x"
                 f"{color.shape[0]}; free some, or record smaller pictures"
             ) from error
-        strands = grouped(maps, self._model.grouping)
-        scores = self._model.calibration.scores(strands.features)
-        return masks_of(strands, scores, color.shape[:2], self._model.least_score), maps
+        size = color.shape[0], color.shape[1]
+        found = instances_of(known, size, self._model, bfloat16=self._bfloat16)
+        return found, maps_in(known)
 
-    def maps(self, color_rgb: UInt8Array) -> Float32Array:
-        """Return the five maps (5, h, w) of an (H, W, 3) picture; h = ceil(zoom H / 2), w alike.
+    def known(self, color_rgb: UInt8Array) -> Float32Array:
+        """Return all the network knows, (K, h, w), of an (H, W, 3) picture; see `UNet.known`.
+
+        h = ceil(zoom H / 2), w alike.
 
         Raises:
             MemoryError: there is not enough even for small tiles.
@@ -111,14 +113,30 @@ class UNetSegmenter:
             )
             kind = self._device.split(":")[0]
             with torch.autocast(kind, torch.bfloat16, enabled=self._bfloat16):
-                output = self._network(picture)
-        maps: Float32Array = output[0].float().cpu().contiguous().numpy()
-        return maps
+                output = self._network.known(picture)
+        # Rearranged before it is widened: half as much to move.
+        known: Float32Array = output[0].cpu().contiguous().float().numpy()
+        return known
 
 
 def _is_memory(error: MemoryError | RuntimeError) -> bool:
     known = isinstance(error, MemoryError | torch.OutOfMemoryError)
     return known or "allocate memory" in str(error)
+
+
+def maps_in(known: Float32Array) -> Float32Array:
+    """Return the maps (8, h, w) in what is known (K, h, w)."""
+    return known[: len(Maps._fields)]
+
+
+def instances_of(
+    known: Float32Array, size: tuple[int, int], model: Model, *, bfloat16: bool = False
+) -> list[BranchMask]:
+    """Return the branches in what is known (K, h, w) of a picture of a size (height, width)."""
+    candidates = candidates_of(maps_in(known), model.grouping)
+    scores = model.scorer.scores(known, candidates, bfloat16=bfloat16)
+    strands, taken = chosen(maps_in(known), candidates, scores, model.grouping)
+    return masks_of(strands, taken, size, model.least_score)
 
 
 def masks_of(

@@ -13,7 +13,6 @@ MULTIPLE_PX = 32
 """The network wants pictures that are a multiple of this in height and width."""
 TILE_PX = 2048
 """A picture larger than this is seen in parts."""
-MAPS = 5
 _OVERLAP_PX = 192
 
 
@@ -29,15 +28,17 @@ def enlarged(color_rgb: UInt8Array, zoom: float) -> UInt8Array:
 def tiled(
     color_rgb: UInt8Array, infer: Callable[[UInt8Array], Float32Array], tile_px: int
 ) -> Float32Array:
-    """Return the maps (5, H / 2, W / 2) of an (H, W, 3) picture, H and W even.
+    """Return the (K, H / 2, W / 2) that come of an (H, W, 3) picture, H and W even.
 
     infer: runs the network on a picture of `MULTIPLE_PX`; the edge is continued up to that.
     """
     height, width = color_rgb.shape[:2]
-    out = np.empty((MAPS, height // STRIDE, width // STRIDE), dtype=np.float32)
+    out = np.empty((0, height // STRIDE, width // STRIDE), dtype=np.float32)
     for rows, own_rows in _spans(height, tile_px):
         for columns, own_columns in _spans(width, tile_px):
             part = infer(_padded(color_rgb[rows, columns]))
+            if not len(out):
+                out = np.empty((len(part), *out.shape[1:]), dtype=np.float32)
             top, left = rows.start // STRIDE, columns.start // STRIDE
             target = out[:, own_rows, own_columns]
             i, j = own_rows.start - top, own_columns.start - left

@@ -4,20 +4,20 @@ The JSON holds the file's SHA-256, which is compared before anything is unpickle
 """
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from canopy_skel.errors import UsageError
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
-from canopy_skel.segmenters.unet.network import UNet
+from canopy_skel.segmenters.unet.grouping import Grouping
+from canopy_skel.segmenters.unet.network import Maps, UNet
+from canopy_skel.segmenters.unet.scorer import Scorer
 from canopy_skel.segmenters.weight_files import (
     read_description,
     read_state,
@@ -25,13 +25,13 @@ from canopy_skel.segmenters.weight_files import (
     write_weights,
 )
 
-FORMAT = "canopy-unet/1"
+FORMAT = "canopy-unet/2"
 BUILTIN = Path(str(files(__package__) / "builtin.pt"))
 _MOST_BYTES = 64 << 20
 _MOST_CHANNELS = 4096
-UNCALIBRATED = Calibration(weights=tuple(4.0 * (name == "branch") for name in FEATURES), bias=-2.0)
-"""Scores for a network nobody has calibrated."""
-_NEEDED = frozenset({"channels", "features", "grouping", "calibration", "least_score"})
+_NEEDED = frozenset({"channels", "grouping", "least_score"})
+_SCORER = "scorer."
+"""Before the names of the scorer's tensors; the network's have none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -45,7 +45,7 @@ class Model:
     channels: tuple[int, ...]
     zoom: float
     grouping: Grouping
-    calibration: Calibration
+    scorer: Scorer
     least_score: float
 
 
@@ -55,13 +55,11 @@ def save(path: Path, model: Model, provenance: dict[str, Any]) -> None:
         "format": FORMAT,
         "channels": list(model.channels),
         "zoom": model.zoom,
-        "features": list(FEATURES),
         "grouping": asdict(model.grouping),
-        "calibration": asdict(model.calibration),
         "least_score": model.least_score,
         **provenance,
     }
-    write_weights(path, model.network.state_dict(), description)
+    write_weights(path, _state_of(model.network, model.scorer), description)
 
 
 def load(path: Path = BUILTIN) -> Model:
@@ -71,53 +69,59 @@ def load(path: Path = BUILTIN) -> Model:
         UsageError: they are not, or there are none.
     """
     description = read_description(path, FORMAT, _NEEDED)
-    if description["features"] != list(FEATURES):
-        raise UsageError(
-            f"{path}: its scores rest on other features than this version's; train anew, or use the"
-            " version that wrote it"
-        )
-    channels, zoom, grouping, calibration, least_score = _settings(path, description)
-    network = UNet(channels)
+    channels, zoom, grouping, least_score = _settings(path, description)
+    network, scorer = UNet(channels), untaught_scorer(channels)
     state = read_state(path, description["sha256"], _MOST_BYTES)
-    require_fit(path, network.state_dict(), state)
-    network.load_state_dict(state)
+    require_fit(path, _state_of(network, scorer), state)
+    own = {name for name in state if name.startswith(_SCORER)}
+    network.load_state_dict({name: state[name] for name in state.keys() - own})
+    scorer.load_state_dict({name.removeprefix(_SCORER): state[name] for name in own})
     return Model(
         network=network.eval(),
         channels=channels,
         zoom=zoom,
         grouping=grouping,
-        calibration=calibration,
+        scorer=scorer.eval(),
         least_score=least_score,
     )
 
 
+def untaught_scorer(channels: Sequence[int]) -> Scorer:
+    """Return a scorer with random weights for a network of such channels."""
+    return Scorer(len(Maps._fields) + channels[0])
+
+
+def _state_of(network: UNet, scorer: Scorer) -> dict[str, Tensor]:
+    own = {_SCORER + name: value for name, value in scorer.state_dict().items()}
+    return network.state_dict() | own
+
+
 def _settings(
     path: Path, description: Mapping[str, Any]
-) -> tuple[tuple[int, ...], float, Grouping, Calibration, float]:
-    """Return channels, zoom, grouping, calibration and least score that a description holds.
+) -> tuple[tuple[int, ...], float, Grouping, float]:
+    """Return channels, zoom, grouping and least score that a description holds.
 
     Raises:
         UsageError: it holds something else.
     """
     try:
         channels = tuple(map(operator.index, description["channels"]))
-        given = description["calibration"]
-        calibration = Calibration(weights=tuple(map(float, given["weights"])), bias=given["bias"])
         least_score = float(description["least_score"])
         zoom = float(description.get("zoom", 1.0))
         if len(channels) < 2 or not 0 < min(channels) <= max(channels) <= _MOST_CHANNELS:
             raise ValueError(f"{channels} are no channels")
-        if len(calibration.weights) != len(FEATURES):
-            raise ValueError(f"{len(calibration.weights)} weights for {len(FEATURES)} features")
-        grouping = Grouping(**description["grouping"])
-        numbers = [*asdict(grouping).values(), *calibration.weights, calibration.bias]
-        if not np.isfinite(numbers).all():
+        given = dict(description["grouping"])
+        centres = tuple(map(float, given.pop("centres")))
+        grouping = Grouping(centres=centres, **given)
+        if not np.isfinite([*centres, *given.values()]).all():
             raise ValueError("not all numbers are finite")
+        if not centres or not all(0 < centre < 1 for centre in centres):
+            raise ValueError(f"centres are {list(centres)}, not some between 0 and 1")
         if not 0.1 <= zoom <= 10:
             raise ValueError(f"zoom is {zoom}, not from 0.1 to 10")
         if not 0 <= least_score <= 1:
             raise ValueError(f"least_score is {least_score}, not from 0 to 1")
-        return channels, zoom, grouping, calibration, least_score
+        return channels, zoom, grouping, least_score
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(
             f"{path.with_suffix('.json')}: does not say how the network is used ({error}); copy"

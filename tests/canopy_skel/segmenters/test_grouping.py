@@ -10,8 +10,7 @@ from scipy.ndimage import label as regions
 
 from canopy_skel.kernels import strands
 from canopy_skel.segmenters.labels import line_of_mask
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping, grouped
+from canopy_skel.segmenters.unet.grouping import Candidates, Grouping, candidates_of, chosen
 from canopy_skel.segmenters.unet.targets import (
     ANGLE,
     ANGLE_STEPS,
@@ -20,13 +19,17 @@ from canopy_skel.segmenters.unet.targets import (
     RADIUS_PX,
     STATE,
     Target,
+    places_of,
     targets_of,
 )
+
+ONE_WAY = Grouping(centres=(0.15,))
 
 
 def perfect_maps(image):
     """What a network that knows the truth would say."""
-    maps = targets_of(image).astype(np.float32)
+    targets = targets_of(image)
+    maps = targets.astype(np.float32)
     angle = maps[..., ANGLE] * (2 * np.pi / ANGLE_STEPS)
     low, high = np.log(RADIUS_PX)
     out = [
@@ -35,14 +38,22 @@ def perfect_maps(image):
         np.cos(angle),
         np.sin(angle),
         maps[..., RADIUS] / 255 * (high - low) + low,
+        *places_of(targets).transpose(2, 0, 1),
     ]
     return np.stack(out).astype(np.float32)
 
 
+def found(maps, grouping=ONE_WAY):
+    """What comes of maps if every strand is as likely as its number of cells says."""
+    candidates = candidates_of(maps, grouping)
+    sizes = np.array([len(cells) for cells in candidates.cells], dtype=float)
+    return chosen(maps, candidates, sizes / (1 + sizes), grouping)
+
+
 def instances(lines, size=(240, 320)):
     """The masks found of perfect maps of these lines, at half size."""
-    found = grouped(perfect_maps(drawn(lines, size)), Grouping())
-    return [found.label == k for k in range(1, len(found.features) + 1)]
+    strands_found, scores = found(perfect_maps(drawn(lines, size)))
+    return [strands_found.label == k for k in range(1, len(scores) + 1)]
 
 
 def covers(mask, truth):
@@ -92,39 +103,66 @@ def test_a_crossing_keeps_the_branch_in_front_whole_and_parts_the_one_behind():
     assert max(covers(mask, front)[0] for mask in masks) > 0.85
 
 
-def test_instances_never_share_a_pixel_and_stay_on_the_branch_map():
-    rng = np.random.default_rng(3)
-    maps = rng.normal(0, 1, (5, 90, 120)).astype(np.float32)
-    found = grouped(maps, Grouping(least_pixels=20, least_length_px=4))
-    assert len(found.features) > 3
-    assert found.label.max() == len(found.features)
-    assert not (found.label[maps[0] <= -0.85] > 0).any()
+def noisy_maps():
+    maps = np.random.default_rng(3).normal(0, 1, (8, 90, 120)).astype(np.float32)
+    maps[1] = 4 * maps[1] - 1  # so that each threshold finds lines of its own
+    return maps
+
+
+def test_instances_stay_on_the_branch_map_and_are_numbered_by_their_scores():
+    maps = noisy_maps()
+    result, scores = found(maps, Grouping(least_pixels=20, least_length_px=4))
+    assert len(scores) > 3
+    assert result.label.max() == len(scores)
+    assert (np.diff(scores) <= 0).all()
+    assert not (result.label[maps[0] <= -0.85] > 0).any()
+
+
+def test_strands_of_one_way_are_disjoint_and_none_comes_twice():
+    candidates = candidates_of(noisy_maps(), Grouping(least_pixels=20, least_length_px=4))
+    assert set(candidates.way) == set(range(5))
+    assert len({cells.tobytes() for cells in candidates.cells}) == len(candidates.cells)
+    for way in range(5):
+        own = [c for c, w in zip(candidates.cells, candidates.way, strict=True) if w == way]
+        together = np.concatenate(own)
+        assert len(np.unique(together)) == len(together)
+
+
+def test_a_line_that_is_weak_in_its_middle_is_two_strands_or_one_as_the_threshold_says():
+    maps = perfect_maps(drawn([straight((160, 120), 0, 240, 7)]))
+    maps[1, :, 72:88] = np.minimum(maps[1, :, 72:88], -1.0)  # a probability of .27
+    way = candidates_of(maps, Grouping()).way
+    assert [(way == k).sum() for k in (0, 3)] == [1, 2]
+
+
+def overlapping():
+    """Three strands on a grid of 4 x 10: the first nearly covers the second."""
+    first, second, third = np.arange(8), np.arange(3, 9), np.arange(20, 30)
+    return Candidates(size=(4, 10), cells=(first, second, third), way=np.array([0, 1, 0]))
+
+
+def test_the_surest_is_taken_first_and_what_it_leaves_goes_to_the_others():
+    maps = np.zeros((8, 4, 10), np.float32)
+    result, scores = chosen(maps, overlapping(), np.array([0.9, 0.8, 0.95]), Grouping())
+    assert scores.tolist() == [0.95, 0.9]  # one cell of six is not enough for the second
+    assert (result.label.ravel()[20:30] == 1).all()
+    assert (result.label.ravel()[:8] == 2).all()
+    assert result.label.ravel()[8] == 0
+    loose = Grouping(taken=0.9)
+    result, scores = chosen(maps, overlapping(), np.array([0.9, 0.8, 0.95]), loose)
+    assert scores.tolist() == [0.95, 0.9, 0.8]
+    assert np.flatnonzero(result.label == 3).tolist() == [8]
+    assert (result.label.ravel()[:8] == 2).all()
+    result, scores = chosen(maps, overlapping(), np.array([0.7, 0.8, 0.95]), Grouping())
+    assert scores.tolist() == [0.95, 0.8]  # three cells of eight is not enough for the first
 
 
 def test_nothing_comes_of_nothing():
     for size in ((1, 1), (40, 60)):
-        found = grouped(np.full((5, *size), -5, np.float32), Grouping())
-        assert found.features.shape == (0, len(FEATURES))
-        assert not found.label.any()
-
-
-def test_features_measure_length_and_radius():
-    found = grouped(perfect_maps(drawn([straight((160, 120), 30, 180, 7)])), Grouping())
-    features = dict(zip(FEATURES, found.features[0], strict=True))
-    assert np.exp(features["log_length"]) == pytest.approx(180, rel=0.1)
-    assert np.exp(features["log_radius"]) == pytest.approx(7, rel=0.05)
-    assert features["fill"] == pytest.approx(1, abs=0.12)
-    assert features["stout"] == pytest.approx(14 / 180, rel=0.15)
-    assert features["direction"] > 0.99
-    assert features["axis"] > 0.99
-    assert features["crook"] < 0.2
-    assert features["sure"] > 0.9
-
-
-def test_a_score_is_the_logistic_of_weighted_features():
-    calibration = Calibration(weights=(2.0, -1.0), bias=0.5)
-    scores = calibration.scores(np.array([[0.0, 0.0], [1.0, 0.5], [-3.0, 1.0]]))
-    assert scores == pytest.approx(1 / (1 + np.exp([-0.5, -2.0, 6.5])))
+        result, scores = found(np.full((8, *size), -5, np.float32), Grouping())
+        assert scores.shape == (0,)
+        assert result.label.shape == size
+        assert not result.label.any()
 
 
 def blobs(seed):

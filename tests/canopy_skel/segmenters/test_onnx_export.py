@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from canopy_skel.errors import UsageError
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.network import UNet, normalised
 from canopy_skel.segmenters.unet.onnx_export import INPUT, OUTPUT, export_onnx
-from canopy_skel.segmenters.unet.weights import Model
+from canopy_skel.segmenters.unet.weights import Model, untaught_scorer
 
 
 @pytest.fixture
@@ -30,13 +29,12 @@ def model():
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_mean.normal_(0, 0.2)
             module.running_var.uniform_(0.5, 2)
-    calibration = Calibration(weights=(0.0,) * len(FEATURES), bias=0.0)
     return Model(
         network=network.eval(),
         channels=channels,
         zoom=1.0,
         grouping=Grouping(),
-        calibration=calibration,
+        scorer=untaught_scorer(channels),
         least_score=0.5,
     )
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 from contracts.segmenter import SegmenterContract
+from scenes.scorers import constant_scorer
 from scenes.views import view_of
 
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.unet import segmenter as module
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping, Strands
+from canopy_skel.segmenters.unet.grouping import Grouping, Strands
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.portable import PortableNetwork
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, masks_of
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in, masks_of
 from canopy_skel.segmenters.unet.weights import Model, load
 
 DEMO = Path(__file__).parents[3] / "recordings/demo_apple.mcap"
@@ -63,7 +63,7 @@ def untrained():
         channels=channels,
         zoom=1.0,
         grouping=Grouping(),
-        calibration=Calibration(weights=(0.0,) * len(FEATURES), bias=0.0),
+        scorer=constant_scorer(channels, 0.0),
         least_score=0.0,
     )
 
@@ -112,15 +112,16 @@ def test_segmenting_keeps_to_one_core_however_many_there_are():
 
 @pytest.mark.parametrize("zoom", [1.0, 1.25, 0.5])
 @pytest.mark.parametrize("size", [(1, 1), (3, 500), (97, 131), (64, 64)])
-def test_pictures_of_any_size_get_maps_of_half_of_it_enlarged(untrained, size, zoom):
-    maps = UNetSegmenter(replace(untrained, zoom=zoom)).maps(noise(*size))
-    assert maps.shape == (5, ceil(size[0] * zoom / 2), ceil(size[1] * zoom / 2))
-    assert np.isfinite(maps).all()
+def test_pictures_of_any_size_are_known_at_half_of_it_enlarged(untrained, size, zoom):
+    known = UNetSegmenter(replace(untrained, zoom=zoom)).known(noise(*size))
+    assert known.shape == (8 + 8, ceil(size[0] * zoom / 2), ceil(size[1] * zoom / 2))
+    assert np.isfinite(known).all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (31, 500), (240, 320)])
 def test_without_torch_the_built_in_network_says_the_same(builtin, size):
-    expected, maps = builtin.maps(noise(*size)), PortableNetwork().maps(noise(*size))
+    expected = maps_in(builtin.known(noise(*size)))
+    maps = PortableNetwork().maps(noise(*size))
     assert maps.shape == expected.shape
     assert np.allclose(maps, expected, atol=1e-3)
 
@@ -131,7 +132,6 @@ def test_an_instance_that_fills_the_picture_covers_all_of_any_size():
         strands = Strands(
             label=np.ones((grid, grid), np.int32),
             surplus=np.ones((grid, grid), np.float32),
-            features=np.zeros((1, len(FEATURES))),
         )
         (mask,) = masks_of(strands, np.ones(1), (size, size), least_score=0.0)
         assert (mask.top_px, mask.left_px, mask.mask.shape) == (0, 0, (size, size))
@@ -147,7 +147,7 @@ def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
     label[:, 2:middle], label[:, middle:-2] = 1, 2
     surplus = np.ones(grid, np.float32)
     surplus[: grid[0] // 2] = -1
-    strands = Strands(label=label, surplus=surplus, features=np.zeros((2, len(FEATURES))))
+    strands = Strands(label=label, surplus=surplus)
     masks = masks_of(strands, np.array([0.4, 0.9]), (height, width), least_score=0.0)
     shown = np.zeros((height, width), int)
     for mask in masks:
@@ -166,15 +166,15 @@ def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
 
 def test_tiles_fit_together_without_a_seam(untrained):
     picture = noise(500, 700)
-    whole = UNetSegmenter(untrained).maps(picture)
-    tiled = UNetSegmenter(untrained, tile_px=320).maps(picture)
+    whole = UNetSegmenter(untrained).known(picture)
+    tiled = UNetSegmenter(untrained, tile_px=320).known(picture)
     assert np.allclose(whole, tiled, atol=1e-4)
 
 
 def test_where_memory_runs_out_tiles_are_made_smaller(untrained, monkeypatch):
     picture = noise(300, 1300)
     segmenter = UNetSegmenter(untrained)
-    whole = segmenter.maps(picture)
+    whole = segmenter.known(picture)
     infer = UNetSegmenter._infer
     seen = []
 
@@ -185,7 +185,7 @@ def test_where_memory_runs_out_tiles_are_made_smaller(untrained, monkeypatch):
         return infer(self, color)
 
     monkeypatch.setattr(UNetSegmenter, "_infer", scarce)
-    assert np.allclose(segmenter.maps(picture), whole, atol=1e-4)
+    assert np.allclose(segmenter.known(picture), whole, atol=1e-4)
     assert max(seen) > 800
     assert min(seen) <= 768
 
@@ -205,7 +205,7 @@ def test_other_errors_are_not_taken_for_lack_of_memory(untrained, monkeypatch):
 
     monkeypatch.setattr(UNetSegmenter, "_infer", broken)
     with pytest.raises(RuntimeError, match="a bug"):
-        UNetSegmenter(untrained).maps(noise(60, 80))
+        UNetSegmenter(untrained).known(noise(60, 80))
 
 
 @pytest.mark.parametrize("color", [np.zeros((40, 60, 3), np.uint16), np.zeros((40, 60), np.uint8)])
@@ -229,8 +229,8 @@ def test_the_number_of_threads_is_bounded(untrained):
 @pytest.mark.skipif(not has_fast_bfloat16(), reason="this CPU has no bfloat16 arithmetic")
 def test_bfloat16_says_nearly_the_same(untrained):
     picture = noise(200, 300)
-    exact = UNetSegmenter(untrained).maps(picture)
-    rough = UNetSegmenter(untrained, bfloat16=True).maps(picture)
+    exact = UNetSegmenter(untrained).known(picture)
+    rough = UNetSegmenter(untrained, bfloat16=True).known(picture)
     assert np.abs(exact - rough).mean() < 0.05 * np.abs(exact).mean()
     assert not np.array_equal(exact, rough)
 

@@ -6,10 +6,16 @@ import pytest
 import torch
 
 from canopy_skel.errors import UsageError
-from canopy_skel.segmenters.unet.features import FEATURES
-from canopy_skel.segmenters.unet.grouping import Calibration, Grouping
+from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.network import UNet, normalised
-from canopy_skel.segmenters.unet.weights import BUILTIN, Model, fused, load, save
+from canopy_skel.segmenters.unet.weights import (
+    BUILTIN,
+    Model,
+    fused,
+    load,
+    save,
+    untaught_scorer,
+)
 
 SMALL = (4, 6, 8)
 
@@ -21,8 +27,8 @@ def model():
         network=UNet(SMALL).eval(),
         channels=SMALL,
         zoom=1.5,
-        grouping=Grouping(branch=0.6),
-        calibration=Calibration(weights=tuple(map(float, range(len(FEATURES)))), bias=-2.0),
+        grouping=Grouping(branch=0.6, centres=(0.1, 0.3)),
+        scorer=untaught_scorer(SMALL).eval(),
         least_score=0.3,
     )
 
@@ -46,12 +52,12 @@ def rehash(path):
 def test_what_was_saved_is_loaded(model, saved):
     again = load(saved)
     assert again.grouping == model.grouping
-    assert again.calibration == model.calibration
     assert (again.channels, again.zoom, again.least_score) == (SMALL, 1.5, 0.3)
-    wanted = model.network.state_dict()
-    for name, value in again.network.state_dict().items():
-        assert value.dtype == wanted[name].dtype
-        assert torch.allclose(value, wanted[name], rtol=1e-3, atol=1e-6)
+    for mine, other in ((model.network, again.network), (model.scorer, again.scorer)):
+        wanted = mine.state_dict()
+        for name, value in other.state_dict().items():
+            assert value.dtype == wanted[name].dtype
+            assert torch.allclose(value, wanted[name], rtol=1e-3, atol=1e-6)
     assert json.loads(saved.with_suffix(".json").read_text())["note"] == "of a test"
 
 
@@ -94,7 +100,7 @@ def test_a_description_that_is_missing_old_or_short_is_named(saved):
     text = beside.read_text()
     for wrong, why in (
         ("{", "is not JSON"),
-        ('{"format": "canopy-unet/0"}', "of format 'canopy-unet/0'"),
+        ('{"format": "canopy-unet/1"}', "of format 'canopy-unet/1'"),
         ("[]", "of format None"),
     ):
         beside.write_text(wrong)
@@ -118,11 +124,13 @@ def test_a_description_that_is_missing_old_or_short_is_named(saved):
         {"channels": [4, -6, 8]},
         {"grouping": None},
         {"grouping": {"sharpness": 1}},
-        {"grouping": {"branch": "0.4"}},
-        {"grouping": {"branch": float("nan")}},
-        {"calibration": {}},
-        {"calibration": {"weights": [1.0], "bias": 0.0}},
-        {"calibration": {"weights": [0.0] * len(FEATURES), "bias": None}},
+        {"grouping": {"centres": [0.1], "sharpness": 1}},
+        {"grouping": {"centres": [0.1], "branch": "0.4"}},
+        {"grouping": {"centres": [0.1], "branch": float("nan")}},
+        {"grouping": {"centres": 0.1}},
+        {"grouping": {"centres": []}},
+        {"grouping": {"centres": [0.1, float("nan")]}},
+        {"grouping": {"centres": [0.1, 1.0]}},
         {"least_score": None},
         {"least_score": -5},
     ],
@@ -148,11 +156,23 @@ def test_folding_normalisation_into_convolutions_changes_nothing(model):
 def test_the_network_answers_at_half_size():
     with torch.inference_mode():
         out = UNet().eval()(normalised(torch.zeros(1, 64, 96, 3, dtype=torch.uint8).numpy()))
-    assert out.shape == (1, 5, 32, 48)
+    assert out.shape == (1, 8, 32, 48)
+
+
+def test_what_the_network_knows_are_its_maps_and_what_they_are_made_of(model):
+    with torch.inference_mode():
+        pictures = normalised(torch.randint(0, 256, (1, 64, 96, 3), dtype=torch.uint8).numpy())
+        known, maps = model.network.known(pictures), model.network(pictures)
+        again = model.network.head(known[:, 8:])
+    assert known.shape == (1, 8 + SMALL[0], 32, 48)
+    assert torch.equal(known[:, :8], maps)
+    assert torch.allclose(again, maps, atol=1e-5)
 
 
 def test_the_built_in_weights_are_small_and_say_where_they_come_from():
     assert BUILTIN.stat().st_size <= 8 << 20
-    assert sum(value.numel() for value in load().network.parameters()) <= 3_000_000
+    model = load()
+    both = [*model.network.parameters(), *model.scorer.parameters()]
+    assert sum(value.numel() for value in both) <= 3_000_000
     facts = json.loads(BUILTIN.with_suffix(".json").read_text(), parse_constant=pytest.fail)
     assert {"training", "validation", "sha256"} <= facts.keys()

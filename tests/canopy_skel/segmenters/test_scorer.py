@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from canopy_skel.segmenters.unet.grouping import Candidates
+from canopy_skel.segmenters.unet.network import Maps
+from canopy_skel.segmenters.unet.scorer import (
+    ACROSS,
+    ALONG,
+    BESIDE,
+    Scorer,
+    mirrored,
+    strips_of,
+)
+
+SIZE = (120, 160)
+MAP = {name: place for place, name in enumerate(Maps._fields)}
+FEATURES = 2
+KNOWN = len(Maps._fields) + FEATURES
+MIDDLE = (80.0, 60.0)
+RADIUS_CELLS = 4.0
+
+
+def bar(angle_deg, length):
+    """Return what a network that knows it would say of a bar in the middle, and its cells."""
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
+    angle = np.radians(angle_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    along = (u - MIDDLE[0]) * c + (v - MIDDLE[1]) * s
+    aside = (v - MIDDLE[1]) * c - (u - MIDDLE[0]) * s
+    inside = (abs(along) <= length / 2) & (abs(aside) <= RADIUS_CELLS)
+    share = -along / (length / 2)
+    known = np.zeros((KNOWN, *SIZE), np.float32)
+    known[MAP["branch"]] = np.where(inside, 4, -20)
+    known[MAP["cosine"]], known[MAP["sine"]] = np.cos(2 * angle), np.sin(2 * angle)
+    known[MAP["log_radius"]] = np.log(2 * RADIUS_CELLS)
+    known[MAP["middle_u"]], known[MAP["middle_v"]] = share * c, share * s
+    known[MAP["log_length"]] = np.log(2 * length)
+    known[-2:] = 7.0
+    return known, np.flatnonzero(inside)
+
+
+def candidates(*cells):
+    return Candidates(size=SIZE, cells=cells, way=np.zeros(len(cells), np.int64))
+
+
+@given(angle=st.floats(0, 180), length=st.floats(40, 70))
+def test_a_strip_shows_a_strand_along_its_axis_whichever_way_it_runs(angle, length):
+    known, cells = bar(angle, length)
+    (strip,) = strips_of(known, candidates(cells))
+    assert strip.shape == (KNOWN + BESIDE, ALONG, ACROSS)
+    reach = np.linspace(-1.5, 1.5, ALONG)
+    sure, middle = abs(reach) < 0.9, ACROSS // 2
+    own, inside = strip[-2], strip[-1]
+    assert own[sure, middle].all()
+    assert not own[abs(reach) > 1.1].any()
+    assert not own[:, [0, -1]].any()  # three radii aside
+    assert inside.all()
+    assert strip[MAP["branch"]][sure, middle] == pytest.approx(4, abs=1e-4)
+    assert strip[MAP["branch"]].min() == -8
+    assert strip[MAP["cosine"]] == pytest.approx(1, abs=0.02)
+    assert strip[MAP["sine"]] == pytest.approx(0, abs=0.1)
+    assert strip[MAP["log_radius"]] == pytest.approx(0, abs=0.01)
+    assert strip[MAP["log_length"]] == pytest.approx(0, abs=0.1)
+    # An axis has no head: what lies ahead may lie behind as well.
+    ways = strip[MAP["middle_u"]][sure, middle]
+    sign = np.sign(ways[0] * -reach[sure][0])
+    assert sign * ways == pytest.approx(-reach[sure], abs=0.12)
+    assert strip[MAP["middle_v"]] == pytest.approx(0, abs=0.1)
+    assert strip[len(Maps._fields) : KNOWN] == pytest.approx(7, abs=1e-4)
+
+
+def test_what_lies_outside_the_picture_is_empty_and_said_to_be():
+    known, _ = bar(0, 40)
+    v, u = np.mgrid[50:58, 0:40]
+    (strip,) = strips_of(known, candidates(np.ravel_multi_index((v.ravel(), u.ravel()), SIZE)))
+    outside = strip[-1] == 0
+    assert outside[:5].all()
+    assert not outside[8:].any()
+    assert (strip[-3][:4] == 0).all()
+    assert strip[-3][8:] == pytest.approx(7, abs=1e-4)
+
+
+def test_strips_of_one_strand_do_not_depend_on_the_others():
+    known, cells = bar(30, 60)
+    other = np.arange(40)
+    (alone,) = strips_of(known, candidates(cells))
+    _, together = strips_of(known, candidates(other, cells))
+    assert np.array_equal(alone, together)
+
+
+def test_scores_are_between_none_and_one_each_for_itself():
+    torch.manual_seed(1)
+    scorer = Scorer(KNOWN).eval()
+    known, cells = bar(30, 60)
+    pair = scorer.scores(known, candidates(np.arange(40), cells))
+    assert pair.shape == (2,)
+    assert ((pair > 0) & (pair < 1)).all()
+    assert scorer.scores(known, candidates(cells))[0] == pytest.approx(pair[1], abs=1e-6)
+    assert scorer.scores(known, candidates()).shape == (0,)
+
+
+def test_more_strands_than_fit_into_one_batch_are_all_scored():
+    scorer = Scorer(KNOWN).eval()
+    known, cells = bar(0, 60)
+    scores = scorer.scores(known, candidates(*[cells[: 100 + k] for k in range(600)]))
+    assert scores.shape == (600,)
+    assert np.isfinite(scores).all()
+
+
+def test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture():
+    known, cells = bar(20, 60)
+    known[MAP["branch"], 30:50, 90:110] = 3.0
+    across = known[:, ::-1].copy()
+    across[[MAP["sine"], MAP["middle_v"]]] *= -1
+    place = np.zeros(SIZE, bool)
+    place.ravel()[cells] = True
+    (strip,) = strips_of(known, candidates(cells))
+    (other,) = strips_of(across, candidates(np.flatnonzero(place[::-1])))
+    wanted = mirrored(torch.from_numpy(strip[None]), along=False, across=True)[0].numpy()
+    # The middle row of an even number of rows lies between two.
+    near = np.abs(other[:-2] - wanted[:-2]) < 0.15
+    assert near.mean() > 0.93
+
+
+def test_a_score_is_the_same_from_either_end():
+    torch.manual_seed(2)
+    scorer = Scorer(KNOWN).eval()
+    strips = torch.randn(5, KNOWN + BESIDE, ALONG, ACROSS)
+    with torch.inference_mode():
+        turned = scorer(mirrored(strips, along=True, across=True))
+        assert torch.allclose(turned, scorer(strips), atol=1e-5)
