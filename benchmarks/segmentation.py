@@ -6,6 +6,7 @@ python benchmarks/segmentation.py FOLDER ../shared/data/recordings --output DIR
 import argparse
 import json
 import os
+from functools import partial
 from pathlib import Path
 from time import process_time
 
@@ -16,9 +17,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from canopy_skel.recording import read_recording
-from canopy_skel.segmenters.unet.grouping import grouped
+from canopy_skel.segmenters.unet.grouping import candidates_of, chosen
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in
 from canopy_skel.segmenters.unet.weights import BUILTIN, load
 from service.evaluation import evaluate_recording
 from service.segmenters import make_for_judging
@@ -43,6 +44,7 @@ ENDS = (
     *("OSR recorded", "OSR unet"),
 )
 TILE = (480, 360)
+LOSSES = ("branch", "centre", "direction", "radius", "middle", "length")
 
 
 def main():
@@ -76,14 +78,18 @@ def curves(entries, path):
     steps = [entry["step"] for entry in entries]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
     for axis, names, title in (
-        (axes[0], ("branch", "centre", "direction", "radius"), "training loss, smoothed"),
-        (axes[1], ("val_iou", "val_centre_iou"), "validation of another kind, cells"),
+        (axes[0], LOSSES, "training loss, smoothed"),
+        (
+            axes[1],
+            ("val_iou", "val_centre_iou", "val_middle"),
+            "validation of another kind: overlap of cells, error of place",
+        ),
         (axes[2], ("val_angle_median", "val_angle_p90"), "error of direction, degrees"),
     ):
         for name in names:
-            axis.plot(steps, [entry[name] for entry in entries], label=name)
+            axis.plot(steps, [entry.get(name, np.nan) for entry in entries], label=name)
         axis.set_title(title)
-        axis.set_xlabel("step (8 crops)")
+        axis.set_xlabel("step")
         axis.legend()
     figure.savefig(path, dpi=90)
     plt.close(figure)
@@ -136,7 +142,7 @@ def compared(recording):
 
 
 def speed():
-    """CPU seconds of one 1440 x 1080 picture on one thread: float32, bfloat16, grouping."""
+    """CPU seconds of one 1440 x 1080 picture on one thread: network, grouping, scores."""
     path = next(Path(__file__).parents[1].glob("recordings/*.mcap"))
     color = next(iter(read_recording(path).views())).color_rgb
     picture = cv2.resize(np.array(color), (1440, 1080))
@@ -146,9 +152,13 @@ def speed():
         if bfloat16 and not has_fast_bfloat16():
             continue
         segmenter = UNetSegmenter(model, bfloat16=bfloat16)
-        maps, seconds[name] = timed(segmenter.maps, picture)
-    _, seconds["grouping"] = timed(grouped, maps, model.grouping)
-    return seconds
+        known, seconds[f"network {name}"] = timed(segmenter.known, picture)
+        strands = candidates_of(maps_in(known), model.grouping)
+        scored = partial(model.scorer.scores, known, strands, bfloat16=bfloat16)
+        scores, seconds[f"scores {name}"] = timed(scored)
+    _, grouping = timed(candidates_of, maps_in(known), model.grouping)
+    _, choice = timed(chosen, maps_in(known), strands, scores, model.grouping)
+    return seconds | {f"grouping into {len(strands.cells)} strands": grouping + choice}
 
 
 def timed(function, *arguments):
@@ -180,7 +190,8 @@ def trained(facts):
         "Made by `benchmarks/segmentation.py`. Every picture is synthetic: nothing here says how"
         " the segmenter does in an orchard.",
         "",
-        f"Trained for {training['steps']} steps of {training['plan'][0]['batch']} crops"
+        f"Trained for {training['steps']} steps of"
+        f" {' and '.join(str(plan['batch']) for plan in training['plan'])} crops"
         f" in {len(training['plan'])} runs ({training['minutes']:g} minutes of wall time on a"
         f" shared core, {training['pictures']} pictures)."
         " [log.jsonl](log.jsonl); ![curves](curves.png)",

@@ -97,7 +97,7 @@ class CanopyScan:
     ) -> Observation:
         """Return what a view shows; nothing changes.
 
-        maps: (5, h, w) of the network; without, no wood is looked for beside the masks.
+        maps: (8, h, w) of the network; without, no wood is looked for beside the masks.
         """
         fragments = self.config.fragments if self.config.use_fragments else None
         return observe(view, list(masks), self.config.pieces, fragments, maps, self._pixel_model)

@@ -85,7 +85,7 @@ def observe(
 ) -> Observation:
     """Lift the masks of a view, and the fragments beside them, into base.
 
-    maps: (5, h, w) of the network, which fragments need. pixel_model: without, the shipped one.
+    maps: (8, h, w) of the network, which fragments need. pixel_model: without, the shipped one.
     `fragments_config` or `maps` None: no fragments.
 
     Raises:

@@ -53,7 +53,7 @@ def wood_probability(
 ) -> Float32Array:
     """Return (H, W) wood probabilities of pixels outside the masks, 0 where nothing is asked.
 
-    Colour, learned from the view's own masks, and the maps (5, h, w) of a network say which pixels
+    Colour, learned from the view's own masks, and the maps (8, h, w) of a network say which pixels
     to ask; the model looks at what lies around them too. One view alone, so that no other view
     changes its fragments.
     """
@@ -124,7 +124,7 @@ def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray
 def fragments_of(probability: Float32Array, maps: Float32Array, config: FragmentConfig) -> Regions:
     """Return the connected components of probable wood, in raster order of blocks of pixels.
 
-    probability: (H, W). maps: (5, h, w) of the network, which knows where they run.
+    probability: (H, W). maps: (8, h, w) of the network, which knows where they run.
     """
     runs = runs_of(probability >= config.min_probability)
     kept = np.flatnonzero((runs.area >= config.min_px) & (runs.area <= config.max_px))

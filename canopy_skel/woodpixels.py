@@ -77,7 +77,7 @@ def layers_of(
 
 
 def hints_of(maps: Float32Array) -> Float32Array:
-    """Return what the model takes from a network's maps (5, h, w): (h, w, HINTS).
+    """Return what the model takes from a network's maps (8, h, w): (h, w, HINTS).
 
     The logits of branch and middle line, the logarithm of the radius, and around each cell the
     highest logit of branch and their mean.
