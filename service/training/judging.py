@@ -18,6 +18,7 @@ from canopy_skel.segmenters.unet.weights import Model
 
 _RIDGE = 1e-3
 _SUREST = 1e-9
+_LEAST_SLOPE = 0.05
 
 
 class Correction(NamedTuple):
@@ -53,7 +54,7 @@ def corrected(judgements: Sequence[Judgement], correction: Correction) -> list[J
 def honest(judgements: Sequence[Judgement]) -> Correction:
     """Return the correction that makes scores the chance to be matched (Platt's; ridge).
 
-    Without any instance it changes nothing.
+    It never turns their order round. Without any instance it changes nothing.
     """
     found = np.concatenate([one.confidence for one in judgements])
     if not len(found):
@@ -69,7 +70,9 @@ def honest(judgements: Sequence[Judgement]) -> Correction:
         gradient = [residual @ x + 2 * _RIDGE * (slope - 1), residual.sum() + 2 * _RIDGE * shift]
         return float(value), np.array(gradient)
 
-    slope, shift = minimize(cost, np.array([1.0, 0.0]), jac=True, method="L-BFGS-B").x
+    bounds = [(_LEAST_SLOPE, None), (None, None)]
+    start = np.array([1.0, 0.0])
+    slope, shift = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     return Correction(slope=float(slope), shift=float(shift))
 
 

@@ -1,9 +1,9 @@
-"""The recipe of the built-in weights: draw, train, choose, calibrate, describe."""
+"""The recipe of the built-in weights: draw, train, choose, teach the scorer, describe."""
 
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from math import inf
@@ -33,8 +33,10 @@ from service.training.scoring import examples_of, taught
 from service.training.store import StoredImages
 
 WANTED_PRECISION = 0.88
-_TAUGHT_STEPS = 6000
-"""The scorer learns so long, but no more steps than the network did."""
+_TAUGHT_STEPS, _FURTHER_STEPS = 6000, 1500
+"""The scorer learns so long, anew or on from another; no more steps than the network did."""
+_AS_MUCH = 0.01
+"""Networks whose overlap with wood differs by less see as much."""
 _TAUGHT_EVERY = 2
 """The scorer of the recipe learns from every second picture."""
 BUILTIN_PLANS = (
@@ -113,7 +115,7 @@ def builtin_weights(
             return look(network)
 
         train(run, lambda: pictures, own, looked)
-    lessons = [without_small(pictures[k]) for k in range(0, len(pictures), _TAUGHT_EVERY)]
+    lessons = (without_small(pictures[k]) for k in range(0, len(pictures), _TAUGHT_EVERY))
     last = folder / f"run{len(runs)}"
     model, facts = finish(runs[-1], last, lessons, None, halves_of(validate))
     facts["training"] |= {
@@ -148,7 +150,7 @@ def shortened(plans: Sequence[Plan], steps: int | None, minutes: float | None) -
 def finish(
     run: Run,
     folder: Path,
-    lessons: Sequence[LabelledImage],
+    lessons: Iterable[LabelledImage],
     init: Scorer | None,
     halves: Halves,
 ) -> tuple[Model, dict[str, Any]]:
@@ -159,7 +161,7 @@ def finish(
     Raises:
         UsageError: the folder holds no averaged weights.
     """
-    path = _best(folder)
+    path = best_of(folder)
     network = UNet(run.plan.channels)
     network.load_state_dict(torch.load(path, weights_only=True))
     model = with_scorer(network, run.step, lessons, init, ZOOM, Grouping())
@@ -189,7 +191,7 @@ def finish(
 def with_scorer(
     network: UNet,
     steps: int,
-    lessons: Sequence[LabelledImage],
+    lessons: Iterable[LabelledImage],
     init: Scorer | None,
     zoom: float,
     grouping: Grouping,
@@ -203,20 +205,23 @@ def with_scorer(
         scorer=untaught_scorer(network.channels),
         least_score=0.0,
     )
-    scorer = taught(examples_of(model, lessons), min(steps, _TAUGHT_STEPS), init)
+    most = _TAUGHT_STEPS if init is None else _FURTHER_STEPS
+    scorer = taught(examples_of(model, lessons), min(steps, most), init)
     return replace(model, scorer=scorer)
 
 
-def _best(folder: Path) -> Path:
-    """Return the averages that knew best where in its piece a cell lies.
+def best_of(folder: Path) -> Path:
+    """Return the averages that knew best where in its piece a cell lies, of those that see as much.
 
-    That is what line-AP is lost by; the overlap of wood differs by .001 towards the end.
+    The place is what line-AP is lost by; it is measured only where wood is found.
     """
     try:
         log = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     except OSError as error:
         raise UsageError(f"{folder}: holds no training log; train first") from error
-    best = min(log, key=lambda entry: float(entry["val_middle"]))
+    most = max(float(entry["val_iou"]) for entry in log)
+    enough = [entry for entry in log if float(entry["val_iou"]) >= most - _AS_MUCH]
+    best = min(enough, key=lambda entry: float(entry["val_middle"]))
     return folder / f"average-{best['step']:06d}.pt"
 
 

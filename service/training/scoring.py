@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -23,7 +24,14 @@ from canopy_skel.segmenters.unet.grouping import (
     surplus_of,
 )
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.scorer import BESIDE, Float16Array, Scorer, mirrored, strips_of
+from canopy_skel.segmenters.unet.scorer import (
+    ACROSS,
+    ALONG,
+    BESIDE,
+    Scorer,
+    mirrored,
+    strips_of,
+)
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in, masks_of
 from canopy_skel.segmenters.unet.weights import Model
 
@@ -43,14 +51,15 @@ class Examples:
     common, by middle line, with the labelled branch it is most like.
     """
 
-    strips: Float16Array
+    strips: NDArray[np.float16]
     overlap: FloatArray
 
 
 def examples_of(model: Model, pictures: Iterable[LabelledImage]) -> Examples:
     """Return all that may be branches in some pictures, but what lies on ignored wood."""
     segmenter = UNetSegmenter(model, bfloat16=has_fast_bfloat16())
-    strips, overlap = [], []
+    channels = len(model.scorer.middle)
+    strips, overlap = [np.zeros((0, channels, ALONG, ACROSS), np.float16)], [np.zeros(0)]
     for picture in pictures:
         known = segmenter.known(picture.color_rgb)
         candidates = candidates_of(maps_in(known), model.grouping)
@@ -68,12 +77,12 @@ def _masks(
 ) -> list[BranchMask]:
     """Return masks of all candidates, numbered from 1; a mask may be empty and is left out then."""
     masks: list[BranchMask] = []
+    surplus, ones = surplus_of(maps_in(known), grouping), np.ones(len(candidates.cells))
     for way in np.unique(candidates.way).tolist():
         label = np.zeros(candidates.size, dtype=np.int32)
         for number in np.flatnonzero(candidates.way == way).tolist():
             label.ravel()[candidates.cells[number]] = number + 1
-        strands = Strands(label=label, surplus=surplus_of(maps_in(known), grouping))
-        ones = np.ones(len(candidates.cells))
+        strands = Strands(label=label, surplus=surplus)
         masks += masks_of(strands, ones, picture.ignore.shape[:2], least_score=0.0)
     return masks
 
@@ -81,22 +90,22 @@ def _masks(
 def taught(examples: Examples, steps: int, init: Scorer | None = None) -> Scorer:
     """Return a scorer fitted to examples; from `init` on, or from random weights.
 
-    Without examples it is `init`, or says one half of everything.
+    Without examples it is `init`, or says one half of everything. One that never saw any example
+    learns as a new one does.
     """
     torch.manual_seed(_SEED)
     scorer = Scorer(examples.strips.shape[1] - BESIDE) if init is None else copy.deepcopy(init)
-    if not len(examples.overlap):
-        scorer.slope.mul_(init is not None)
-        return scorer.eval()
-    if init is None:
-        _standardise(scorer, examples)
-    peak = _PEAK_RATE if init is None else _GENTLE_RATE
-    for seed, judge in enumerate(scorer.judges):
-        teach(scorer, judge, examples, steps, peak, seed)
+    known_well = bool(scorer.seen)
+    if len(examples.overlap):
+        if not known_well:
+            _standardise(scorer, examples)
+        peak = _GENTLE_RATE if known_well else _PEAK_RATE
+        for seed, judge in enumerate(scorer.judges):
+            _teach(scorer, judge, examples, steps, peak, seed)
     return scorer.eval()
 
 
-def teach(
+def _teach(
     scorer: Scorer, judge: nn.Module, examples: Examples, steps: int, peak: float, seed: int
 ) -> None:
     """Fit one judge of a scorer to examples, in place; the others do not count."""
@@ -127,3 +136,4 @@ def _standardise(scorer: Scorer, examples: Examples) -> None:
     seen = examples.strips[np.sort(some)].astype(np.float32)
     scorer.middle.copy_(torch.from_numpy(seen.mean(axis=(0, 2, 3))))
     scorer.spread.copy_(torch.from_numpy(seen.std(axis=(0, 2, 3)) + 1e-3))
+    scorer.seen.fill_(1.0)

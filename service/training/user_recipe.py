@@ -2,7 +2,7 @@
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,7 @@ def user_weights(
     shown = validate if len(validate) else train_set
     look = Look(shown, range(min(len(shown), 20)), ZOOM)
     train(run, lambda: train_set, folder / "run", look)
-    lessons = [train_set[k] for k in range(len(train_set))]
+    lessons = (train_set[k] for k in range(len(train_set)))
     judged = [validate[k] for k in range(len(validate))]
     model, facts = _finished(run, folder / "run", lessons, judged, init)
     facts["training"] |= {"pictures": len(train_set), "scans": imported.scans}
@@ -144,11 +144,15 @@ def _digest(labels: Path, state: Mapping[str, Tensor] | None) -> str:
 def _finished(
     run: Run,
     folder: Path,
-    lessons: Sequence[LabelledImage],
+    lessons: Iterable[LabelledImage],
     validate: Sequence[LabelledImage],
     init: Model | None,
 ) -> tuple[Model, dict[str, Any]]:
-    """Teach the scorer, calibrate and measure; keep to what `init` reports where little is left."""
+    """Teach the scorer, calibrate and measure; keep to that of `init` where little is left.
+
+    On the pictures the network has learned by heart nearly every strand is right; without others to
+    set it right the scorer would be too sure.
+    """
     scorer = None if init is None else init.scorer
     if sum(len(image.lines) for image in validate) >= ENOUGH_INSTANCES:
         halves = Halves(choose=validate, report=validate)
@@ -158,9 +162,11 @@ def _finished(
             " them too, so expect a little less elsewhere"
         )
         return model, facts
-    zoom, grouping = (ZOOM, Grouping()) if init is None else (init.zoom, init.grouping)
-    model = with_scorer(run.averaged, run.step, lessons, scorer, zoom, grouping)
-    model = replace(model, least_score=0.5 if init is None else init.least_score)
+    if init is None:
+        model = with_scorer(run.averaged, run.step, lessons, None, ZOOM, Grouping())
+        model = replace(model, least_score=0.5)
+    else:
+        model = replace(init, network=run.averaged.eval())
     kind = "none: too few instances in scans that were not trained on"
     training = {"plan": run.plan.fields(), "steps": run.step, "torch": torch.__version__}
     return model, {"validation": {"kind": kind, "reported": {}}, "training": training}

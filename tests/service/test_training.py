@@ -19,7 +19,7 @@ from service.training.crops import draw_batch
 from service.training.judging import Correction, corrected, corrected_scorer, honest, threshold
 from service.training.look import Look
 from service.training.loop import Plan, resume, start, train
-from service.training.recipe import BUILTIN_PLANS, builtin_weights, shortened
+from service.training.recipe import BUILTIN_PLANS, best_of, builtin_weights, shortened
 from service.training.store import StoredImages, store
 
 TINY = Plan(steps=15, batch=3, crop_px=64, look_every=5, warm_up=3, channels=(4, 8, 8))
@@ -268,6 +268,7 @@ def test_honest_scores_are_the_share_that_is_matched():
 def test_a_corrected_scorer_says_what_the_correction_does():
     torch.manual_seed(0)
     scorer = Scorer(9).eval()
+    scorer.seen.fill_(1.0)
     strips = torch.randn(20, 11, 32, 9)
     once = Correction(slope=1.5, shift=-0.5)
     with torch.inference_mode():
@@ -276,6 +277,25 @@ def test_a_corrected_scorer_says_what_the_correction_does():
             scorer = corrected_scorer(scorer, correction)
             before = correction.of(before)
             assert torch.sigmoid(scorer(strips)).numpy() == pytest.approx(before, abs=1e-5)
+
+
+def test_a_correction_never_turns_scores_round():
+    scores = np.linspace(0.1, 0.9, 40)
+    correction = honest([judgement(scores < 0.5, scores)])
+    assert correction.slope > 0
+    assert (np.diff(correction.of(scores)) > 0).all()
+
+
+def test_the_checkpoint_is_the_one_that_knows_places_best_of_those_that_see_as_much(tmp_path):
+    looks = [(100, 0.30, 0.1), (200, 0.60, 0.4), (300, 0.595, 0.3), (400, 0.598, 0.35)]
+    lines = [
+        json.dumps({"step": step, "val_iou": iou, "val_middle": middle})
+        for step, iou, middle in looks
+    ]
+    (tmp_path / "log.jsonl").write_text("\n".join(lines))
+    assert best_of(tmp_path).name == "average-000300.pt"
+    with pytest.raises(UsageError, match="holds no training log; train first"):
+        best_of(tmp_path / "nowhere")
 
 
 def test_without_any_instance_scores_stay():

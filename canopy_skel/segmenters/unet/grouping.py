@@ -26,10 +26,10 @@ class Grouping:
     """How maps become instances; lengths in pixels of the picture.
 
     branch: least probability of a cell on a branch. centres: of one on a middle line, one for each
-    way of parting what is seen. outline: that of a
-    pixel in the finished mask; what is only likely would make wood thick (a third of the choosing
-    pictures: twigs 20 % too thick at .4, 6 % at .75, at the price of line-AP). gate_deg: largest
-    turn, ratio: largest logarithmic step of the radius from cell to cell. bend_*: a strand is cut
+    way of parting what is seen. outline: that of a pixel in the finished mask; what is only likely
+    would make wood thick (a third of the choosing pictures: twigs 20 % too thick at .4, 6 % at .75,
+    at the price of line-AP). gate_deg: largest turn, ratio: largest logarithmic step of the radius
+    from cell to cell. bend_*: a strand is cut
     where it leaves its chord by more than each of these. reach: how many radii it grows from its
     middle. taken: the largest share of a strand that surer ones may have taken of it.
     """
@@ -99,7 +99,8 @@ def chosen(
 ) -> tuple[Strands, FloatArray]:
     """Return what candidates come to, the surest first, and the score of instance i at i - 1.
 
-    One that surer ones have taken too much of is dropped; else it keeps what is left.
+    One that surer ones have taken too much of is dropped; else it keeps what is left, which may be
+    in two parts, or less than `least_pixels`.
     """
     label = np.zeros(maps[0].size, dtype=np.int32)
     taken: list[float] = []

@@ -5,11 +5,10 @@ end, of everything the large network knows there: where it stops, what it touche
 in. All strands of a picture are scored at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -32,8 +31,6 @@ _JUDGES, _WIDTH, _UNITS = 3, 32, 48
 _DROPPED = 0.2
 _BATCH = 512
 _MAP = {name: place for place, name in enumerate(Maps._fields)}
-
-Float16Array = NDArray[np.float16]
 
 
 class _Judge(nn.Module):
@@ -68,13 +65,14 @@ class Scorer(nn.Module):
     """From strips to logits: the mean of what several judges say of a strip seen from either end.
 
     Buffers: `middle` and `spread` of each channel of what it was fitted to; `slope` and `shift`
-    make its logits honest.
+    make its logits honest; `seen`: 0 where it never saw an example, and says one half of all.
     """
 
     middle: Tensor
     spread: Tensor
     slope: Tensor
     shift: Tensor
+    seen: Tensor
 
     def __init__(self, known: int) -> None:
         """`known`: how many channels the large network knows, see `UNet.known`."""
@@ -85,6 +83,7 @@ class Scorer(nn.Module):
         self.register_buffer("spread", torch.ones(channels))
         self.register_buffer("slope", torch.ones(()))
         self.register_buffer("shift", torch.zeros(()))
+        self.register_buffer("seen", torch.zeros(()))
 
     def forward(self, strips: Tensor) -> Tensor:
         """Return (N,) logits of (N, C, ALONG, ACROSS) strips, see `strips_of`."""
@@ -93,7 +92,7 @@ class Scorer(nn.Module):
             for turned in (False, True)
         ]
         said = [judge(view) for judge in self.judges for view in views]
-        return self.slope * torch.stack(said).mean(dim=0) + self.shift
+        return self.seen * (self.slope * torch.stack(said).mean(dim=0) + self.shift)
 
     def standardised(self, strips: Tensor) -> Tensor:
         """Return strips as judges want them."""
@@ -104,10 +103,17 @@ class Scorer(nn.Module):
         self, known: Float32Array, candidates: Candidates, *, bfloat16: bool = False
     ) -> FloatArray:
         """Return (N,) scores in (0, 1) of candidates. known: (K, h, w), see `UNet.known`."""
-        strips = torch.from_numpy(strips_of(known, candidates))
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            parts = [torch.sigmoid(self(part)) for part in torch.split(strips, _BATCH)]
-        return np.asarray(torch.cat(parts).double().numpy())
+        parts = [np.zeros(0)]
+        for first in range(0, len(candidates.cells), _BATCH):
+            some = replace(
+                candidates,
+                cells=candidates.cells[first : first + _BATCH],
+                way=candidates.way[first : first + _BATCH],
+            )
+            strips = torch.from_numpy(strips_of(known, some))
+            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+                parts.append(torch.sigmoid(self(strips)).double().numpy())
+        return np.concatenate(parts)
 
 
 def mirrored(strips: Tensor, *, along: bool, across: bool) -> Tensor:

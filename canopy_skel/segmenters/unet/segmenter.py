@@ -77,14 +77,17 @@ class UNetSegmenter:
             )
         try:
             known = self.known(color)
-        except MemoryError as error:
+            rough = self._bfloat16 and self._device == "cpu"
+            size = color.shape[0], color.shape[1]
+            found = instances_of(known, size, self._model, bfloat16=rough)
+        except (MemoryError, RuntimeError) as error:
+            if not _is_memory(error):
+                raise
             raise ViewError(
                 f"view {view.index}: no memory left for a picture of {color.shape[1]}x"
                 f"{color.shape[0]}; free some, or record smaller pictures"
             ) from error
-        size = color.shape[0], color.shape[1]
-        found = instances_of(known, size, self._model, bfloat16=self._bfloat16)
-        return found, maps_in(known)
+        return found, maps_in(known).copy()  # the features are not kept
 
     def known(self, color_rgb: UInt8Array) -> Float32Array:
         """Return all the network knows, (K, h, w), of an (H, W, 3) picture; see `UNet.known`.

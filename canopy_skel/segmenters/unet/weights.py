@@ -117,6 +117,8 @@ def _settings(
             raise ValueError("not all numbers are finite")
         if not centres or not all(0 < centre < 1 for centre in centres):
             raise ValueError(f"centres are {list(centres)}, not some between 0 and 1")
+        if not 0 <= grouping.taken < 1:
+            raise ValueError(f"taken is {grouping.taken}, not from 0 to below 1")
         if not 0.1 <= zoom <= 10:
             raise ValueError(f"zoom is {zoom}, not from 0.1 to 10")
         if not 0 <= least_score <= 1:

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from canopy_skel.segmenters.unet.grouping import Candidates
 from canopy_skel.segmenters.unet.network import Maps
+from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.scorer import (
     ACROSS,
     ALONG,
@@ -91,9 +92,16 @@ def test_strips_of_one_strand_do_not_depend_on_the_others():
     assert np.array_equal(alone, together)
 
 
-def test_scores_are_between_none_and_one_each_for_itself():
+def random_scorer():
+    """A scorer that is not taught but speaks its mind."""
     torch.manual_seed(1)
     scorer = Scorer(KNOWN).eval()
+    scorer.seen.fill_(1.0)
+    return scorer
+
+
+def test_scores_are_between_none_and_one_each_for_itself():
+    scorer = random_scorer()
     known, cells = bar(30, 60)
     pair = scorer.scores(known, candidates(np.arange(40), cells))
     assert pair.shape == (2,)
@@ -103,11 +111,26 @@ def test_scores_are_between_none_and_one_each_for_itself():
 
 
 def test_more_strands_than_fit_into_one_batch_are_all_scored():
-    scorer = Scorer(KNOWN).eval()
+    scorer = random_scorer()
     known, cells = bar(0, 60)
-    scores = scorer.scores(known, candidates(*[cells[: 100 + k] for k in range(600)]))
-    assert scores.shape == (600,)
-    assert np.isfinite(scores).all()
+    shorter = [cells[: 100 + k % 5] for k in range(600)]
+    scores = scorer.scores(known, candidates(*shorter))
+    assert scores == pytest.approx(np.tile(scores[:5], 120), abs=1e-5)
+    assert len(np.unique(scores[:5])) == 5
+
+
+def test_one_that_never_saw_a_strand_says_one_half():
+    known, cells = bar(0, 60)
+    assert Scorer(KNOWN).eval().scores(known, candidates(cells)) == 0.5
+
+
+@pytest.mark.skipif(not has_fast_bfloat16(), reason="this CPU has no bfloat16 arithmetic")
+def test_bfloat16_scores_nearly_the_same():
+    known, cells = bar(30, 60)
+    scorer, both = random_scorer(), candidates(np.arange(40), cells)
+    assert scorer.scores(known, both, bfloat16=True) == pytest.approx(
+        scorer.scores(known, both), abs=0.01
+    )
 
 
 def test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture():
@@ -126,8 +149,7 @@ def test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture():
 
 
 def test_a_score_is_the_same_from_either_end():
-    torch.manual_seed(2)
-    scorer = Scorer(KNOWN).eval()
+    scorer = random_scorer()
     strips = torch.randn(5, KNOWN + BESIDE, ALONG, ACROSS)
     with torch.inference_mode():
         turned = scorer(mirrored(strips, along=True, across=True))

@@ -131,6 +131,7 @@ def test_a_description_that_is_missing_old_or_short_is_named(saved):
         {"grouping": {"centres": []}},
         {"grouping": {"centres": [0.1, float("nan")]}},
         {"grouping": {"centres": [0.1, 1.0]}},
+        {"grouping": {"centres": [0.1], "taken": 1.0}},
         {"least_score": None},
         {"least_score": -5},
     ],

@@ -8,7 +8,7 @@ from scenes.scorers import constant_scorer
 
 from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.network import Maps, UNet
-from canopy_skel.segmenters.unet.scorer import ACROSS, ALONG, BESIDE, Scorer
+from canopy_skel.segmenters.unet.scorer import ACROSS, ALONG, BESIDE
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.targets import places_of, targets_of
 from canopy_skel.segmenters.unet.weights import Model
@@ -57,8 +57,19 @@ def test_without_examples_a_scorer_stays_or_says_one_half():
     none = Examples(strips=examples(4).strips[:0], overlap=np.zeros(0))
     strips = examples(5).strips
     assert (logits(taught(none, 10), strips) == 0).all()
-    known = Scorer(KNOWN).eval()
+    known = taught(examples(), 5)
     assert np.array_equal(logits(taught(none, 10, known), strips), logits(known, strips))
+
+
+def test_one_that_never_saw_an_example_learns_as_a_new_one():
+    none = Examples(strips=examples(4).strips[:0], overlap=np.zeros(0))
+    scorer = taught(examples(), 60, taught(none, 10))
+    others = examples(seed=1)
+    assert ((logits(scorer, others.strips) > 0) == (others.overlap > 0.5)).mean() > 0.95
+
+
+def test_no_pictures_are_no_examples(model):
+    assert len(examples_of(model, []).overlap) == 0
 
 
 @pytest.fixture
