@@ -19,7 +19,7 @@ import numpy as np
 from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.unet.grouping import candidates_of, chosen
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.weights import BUILTIN, load
 from service.evaluation import evaluate_recording
 from service.segmenters import make_for_judging
@@ -153,11 +153,11 @@ def speed():
             continue
         segmenter = UNetSegmenter(model, bfloat16=bfloat16)
         known, seconds[f"network {name}"] = timed(segmenter.known, picture)
-        strands = candidates_of(maps_in(known), model.grouping)
+        strands = candidates_of(known.maps, model.grouping)
         scored = partial(model.scorer.scores, known, strands, bfloat16=bfloat16)
         scores, seconds[f"scores {name}"] = timed(scored)
-    _, grouping = timed(candidates_of, maps_in(known), model.grouping)
-    _, choice = timed(chosen, maps_in(known), strands, scores, model.grouping)
+    _, grouping = timed(candidates_of, known.maps, model.grouping)
+    _, choice = timed(chosen, known.maps, strands, scores, model.grouping)
     return seconds | {f"grouping into {len(strands.cells)} strands": grouping + choice}
 
 

@@ -26,7 +26,7 @@ NEEDED_BY = {
     "paper": _OF_JOINERS | {"joins", "search"},
     "mst": _OF_JOINERS,
     "ftsem": _OF_JOINERS,
-    "unet": frozenset({"strands"}),
+    "unet": frozenset({"strands", "strips"}),
 }
 """The modules that each method uses, and each segmenter; what those import is not listed."""
 

@@ -9,7 +9,7 @@ from canopy_skel.frame import Float32Array
 from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.targets import (
     ANGLE,
     ANGLE_STEPS,
@@ -46,7 +46,7 @@ class Look:
         totals, turns, ways = np.zeros(4), [np.zeros(0)], [np.zeros(0)]
         for number in self._numbers:
             maps = np.array(self._images.maps(number))
-            seen = maps_in(segmenter.known(np.array(self._images.color(number))))
+            seen = segmenter.known(np.array(self._images.color(number))).maps
             counts, turn, way = _compared(_on_grid(seen, maps.shape[:2]), maps)
             totals += counts
             turns.append(turn)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray
 from canopy_skel.metrics.lines import LEAST_OVERLAP
 from canopy_skel.metrics.segmentation import best_overlaps
@@ -23,6 +22,7 @@ from canopy_skel.segmenters.unet.grouping import (
     candidates_of,
     surplus_of,
 )
+from canopy_skel.segmenters.unet.network import Known
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.scorer import (
     ACROSS,
@@ -32,7 +32,7 @@ from canopy_skel.segmenters.unet.scorer import (
     mirrored,
     strips_of,
 )
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in, masks_of
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, masks_of
 from canopy_skel.segmenters.unet.weights import Model
 
 _BATCH = 256
@@ -62,7 +62,7 @@ def examples_of(model: Model, pictures: Iterable[LabelledImage]) -> Examples:
     strips, overlap = [np.zeros((0, channels, ALONG, ACROSS), np.float16)], [np.zeros(0)]
     for picture in pictures:
         known = segmenter.known(picture.color_rgb)
-        candidates = candidates_of(maps_in(known), model.grouping)
+        candidates = candidates_of(known.maps, model.grouping)
         masks = _masks(known, candidates, picture, model.grouping)
         common = best_overlaps(masks, picture)
         own = np.array([mask.instance - 1 for mask in masks], dtype=np.int64)
@@ -73,11 +73,11 @@ def examples_of(model: Model, pictures: Iterable[LabelledImage]) -> Examples:
 
 
 def _masks(
-    known: Float32Array, candidates: Candidates, picture: LabelledImage, grouping: Grouping
+    known: Known, candidates: Candidates, picture: LabelledImage, grouping: Grouping
 ) -> list[BranchMask]:
     """Return masks of all candidates, numbered from 1; a mask may be empty and is left out then."""
     masks: list[BranchMask] = []
-    surplus, ones = surplus_of(maps_in(known), grouping), np.ones(len(candidates.cells))
+    surplus, ones = surplus_of(known.maps, grouping), np.ones(len(candidates.cells))
     for way in np.unique(candidates.way).tolist():
         label = np.zeros(candidates.size, dtype=np.int32)
         for number in np.flatnonzero(candidates.way == way).tolist():

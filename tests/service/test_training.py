@@ -9,6 +9,7 @@ from scenes.drawn import drawn, straight
 
 from canopy_skel.errors import UsageError
 from canopy_skel.metrics.segmentation import Judgement, segmentation_scores
+from canopy_skel.segmenters.unet.network import Known
 from canopy_skel.segmenters.unet.scorer import Scorer
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.targets import places_of
@@ -116,7 +117,8 @@ def test_pictures_another_version_stored_are_refused(images, tmp_path, monkeypat
 
 def test_a_look_measures_how_far_off_the_maps_are(images, monkeypatch):
     def says(maps):
-        monkeypatch.setattr(UNetSegmenter, "known", lambda self, color: maps)
+        known = Known(maps=maps, features=maps[:0])
+        monkeypatch.setattr(UNetSegmenter, "known", lambda self, color: known)
         return Look(images, [0], 1.0)(start(TINY).network)
 
     truth = images.maps(0)

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from canopy_skel.frame import Float32Array, UInt8Array
-from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, tiled
+from canopy_skel.segmenters.unet.targets import STRIDE
+from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, padded, tiled
 
 MODEL_FILE, DESCRIPTION_FILE = "builtin.onnx.gz", "builtin.json"
 
@@ -29,8 +30,11 @@ class PortableNetwork:
 
     def maps(self, color_rgb: UInt8Array) -> Float32Array:
         """Return the eight maps (8, h, w) of an (H, W, 3) picture, see `network.Maps`."""
-        return tiled(enlarged(color_rgb, self._zoom), self._infer, TILE_PX)
+        (maps,) = tiled(enlarged(color_rgb, self._zoom), self._infer, TILE_PX)
+        return maps
 
-    def _infer(self, color_rgb: UInt8Array) -> Float32Array:
-        self._network.setInput(cv2.dnn.blobFromImage(color_rgb))
-        return np.asarray(self._network.forward()[0], dtype=np.float32)
+    def _infer(self, color_rgb: UInt8Array) -> tuple[Float32Array]:
+        self._network.setInput(cv2.dnn.blobFromImage(padded(color_rgb)))
+        height, width = (size // STRIDE for size in color_rgb.shape[:2])
+        maps = self._network.forward()[0, :, :height, :width]
+        return (np.ascontiguousarray(maps, dtype=np.float32),)

@@ -5,17 +5,17 @@ end, of everything the large network knows there: where it stops, what it touche
 in. All strands of a picture are scored at once.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from canopy_skel.frame import Float32Array
 from canopy_skel.geometry import FloatArray
+from canopy_skel.kernels import strips
 from canopy_skel.segmenters.unet.grouping import Candidates
-from canopy_skel.segmenters.unet.network import Maps
+from canopy_skel.segmenters.unet.network import Known, Maps
 from canopy_skel.segmenters.unet.targets import STRIDE
 
 ALONG, ACROSS = 32, 9
@@ -99,10 +99,8 @@ class Scorer(nn.Module):
         z = (strips - self.middle[:, None, None]).div_(self.spread[:, None, None])
         return z.clamp_(-_MOST_SPREADS, _MOST_SPREADS)
 
-    def scores(
-        self, known: Float32Array, candidates: Candidates, *, bfloat16: bool = False
-    ) -> FloatArray:
-        """Return (N,) scores in (0, 1) of candidates. known: (K, h, w), see `UNet.known`."""
+    def scores(self, known: Known, candidates: Candidates, *, bfloat16: bool = False) -> FloatArray:
+        """Return (N,) scores in (0, 1) of candidates."""
         parts = [np.zeros(0)]
         for first in range(0, len(candidates.cells), _BATCH):
             some = replace(
@@ -110,9 +108,9 @@ class Scorer(nn.Module):
                 cells=candidates.cells[first : first + _BATCH],
                 way=candidates.way[first : first + _BATCH],
             )
-            strips = torch.from_numpy(strips_of(known, some))
+            looked = torch.from_numpy(strips_of(known, some))
             with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-                parts.append(torch.sigmoid(self(strips)).double().numpy())
+                parts.append(torch.sigmoid(self(looked)).double().numpy())
         return np.concatenate(parts)
 
 
@@ -125,97 +123,23 @@ def mirrored(strips: Tensor, *, along: bool, across: bool) -> Tensor:
     return strips
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
-class _Axis:
-    """Of N strands, in cells: middle (u, v), angle, half the length and half the strip's width."""
-
-    u: FloatArray
-    v: FloatArray
-    angle: FloatArray
-    half: FloatArray
-    side: FloatArray
-    log_radius: FloatArray
-
-
-def strips_of(known: Float32Array, candidates: Candidates) -> Float32Array:
-    """Return (N, K + BESIDE, ALONG, ACROSS) strips of what is known (K, h, w) of a picture.
+def strips_of(known: Known, candidates: Candidates) -> Float32Array:
+    """Return (N, 8 + K + BESIDE, ALONG, ACROSS) strips of what is known of a picture.
 
     Directions and ways are turned to the strand's axis; radius and length are those beside the
-    strand's own.
+    strand's own. In memory, the channels of a sample lie side by side, as convolutions like them.
     """
     height, width = candidates.size
-    shape = len(candidates.cells), len(known) + BESIDE, ALONG, ACROSS
-    out = np.zeros(shape, dtype=np.float32)
-    if not len(out):
-        return out
-    axis = _axis_of(known, candidates)
-    along = np.linspace(-_BEYOND, _BEYOND, ALONG)[:, None] * axis.half[:, None, None]
-    across = np.linspace(-1.0, 1.0, ACROSS) * axis.side[:, None, None]
-    cosine, sine = np.cos(axis.angle)[:, None, None], np.sin(axis.angle)[:, None, None]
-    u = axis.u[:, None, None] + along * cosine - across * sine
-    v = axis.v[:, None, None] + along * sine + across * cosine
-    out[:, : len(known)] = _sampled(known, u, v)
-    _turn(out, axis)
-    column, row = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    place = np.where(inside, row * width + column, height * width)
-    own = np.zeros(height * width + 1, dtype=np.bool_)
-    for number, cells in enumerate(candidates.cells):
-        own[cells] = True
-        out[number, len(known)] = own[place[number]]
-        own[cells] = False
-    out[:, len(known) + 1] = inside
-    return out
-
-
-def _axis_of(known: Float32Array, candidates: Candidates) -> _Axis:
-    parts = []
-    for cells in candidates.cells:
-        row, column = np.divmod(cells.astype(np.int64), candidates.size[1])
-        u, v = column.mean(), row.mean()
-        du, dv = column - u, row - v
-        angle = 0.5 * np.arctan2(2 * (du * dv).mean(), (du * du).mean() - (dv * dv).mean())
-        along = du * np.cos(angle) + dv * np.sin(angle)
-        low, high = along.min() - 0.5, along.max() + 0.5
-        middle = 0.5 * (low + high)
-        log_radius = known[_MAP["log_radius"], row, column].mean() - np.log(STRIDE)
-        parts.append(
-            (
-                u + middle * np.cos(angle),
-                v + middle * np.sin(angle),
-                angle,
-                0.5 * (high - low),
-                max(_SIDE_RADII * np.exp(log_radius), _LEAST_SIDE_CELLS),
-                log_radius,
-            )
-        )
-    u, v, angle, half, side, log_radius = np.array(parts).T
-    return _Axis(u=u, v=v, angle=angle, half=half, side=side, log_radius=log_radius)
-
-
-def _sampled(known: Float32Array, u: FloatArray, v: FloatArray) -> Float32Array:
-    """Return (N, K, ALONG, ACROSS) of what is known, between cells; zero outside."""
-    height, width = known.shape[1:]
-    grid = np.stack([2 * (u + 0.5) / width - 1, 2 * (v + 0.5) / height - 1], axis=-1)
-    grid = grid.astype(np.float32).reshape(1, -1, ACROSS, 2)
-    found = functional.grid_sample(
-        torch.from_numpy(known)[None], torch.from_numpy(grid), align_corners=False
+    count = len(candidates.cells)
+    ends = np.cumsum([0, *map(len, candidates.cells)])
+    cells = np.concatenate([np.empty(0, dtype=np.int64), *candidates.cells])
+    axes = np.empty((count, strips.AXIS))
+    strips.axes(cells, ends, known.maps, STRIDE, axes)
+    side = np.maximum(_SIDE_RADII / STRIDE * np.exp(axes[:, 5]), _LEAST_SIDE_CELLS)
+    channels = len(known.maps) + len(known.features) + BESIDE
+    out = np.empty((count, ALONG, ACROSS, channels), dtype=np.float32)
+    own = np.zeros(height * width, dtype=np.bool_)
+    strips.looked_along(
+        known.maps, known.features, axes, side, cells, ends, _BEYOND, _MOST_LOGIT, own, out
     )
-    strips = found[0].reshape(len(known), -1, ALONG, ACROSS).permute(1, 0, 2, 3)
-    return np.asarray(strips.numpy(), dtype=np.float32)
-
-
-def _turn(strips: Float32Array, axis: _Axis) -> None:
-    """Say of the maps of a strip what they are along and across it, in place."""
-    logits = [_MAP["branch"], _MAP["centre"]]
-    strips[:, logits] = np.clip(strips[:, logits], -_MOST_LOGIT, _MOST_LOGIT)
-    for u, v, angle in (
-        ("cosine", "sine", 2 * axis.angle),
-        ("middle_u", "middle_v", axis.angle),
-    ):
-        x, y = strips[:, _MAP[u]], strips[:, _MAP[v]]
-        c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
-        strips[:, [_MAP[u], _MAP[v]]] = np.stack([x * c + y * s, y * c - x * s], axis=1)
-    own = axis.log_radius + np.log(STRIDE)
-    strips[:, _MAP["log_radius"]] -= own[:, None, None]
-    strips[:, _MAP["log_length"]] -= np.log(2 * STRIDE * axis.half)[:, None, None]
+    return out.transpose(0, 3, 1, 2)

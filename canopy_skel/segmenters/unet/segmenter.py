@@ -14,9 +14,10 @@ from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.unet.grouping import Strands, candidates_of, chosen
-from canopy_skel.segmenters.unet.network import Maps, channels_last, normalised
+from canopy_skel.segmenters.unet.network import Known, channels_last, normalised
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, tiled
+from canopy_skel.segmenters.unet.targets import STRIDE
+from canopy_skel.segmenters.unet.tiles import TILE_PX, enlarged, padded, tiled
 from canopy_skel.segmenters.unet.weights import Model, fused
 
 _SMALLEST_TILE_PX = 512
@@ -87,12 +88,10 @@ class UNetSegmenter:
                 f"view {view.index}: no memory left for a picture of {color.shape[1]}x"
                 f"{color.shape[0]}; free some, or record smaller pictures"
             ) from error
-        return found, maps_in(known).copy()  # the features are not kept
+        return found, known.maps
 
-    def known(self, color_rgb: UInt8Array) -> Float32Array:
-        """Return all the network knows, (K, h, w), of an (H, W, 3) picture; see `UNet.known`.
-
-        h = ceil(zoom H / 2), w alike.
+    def known(self, color_rgb: UInt8Array) -> Known:
+        """Return all the network says of an (H, W, 3) picture; h = ceil(zoom H / 2), w alike.
 
         Raises:
             MemoryError: there is not enough even for small tiles.
@@ -101,7 +100,7 @@ class UNetSegmenter:
         tile = self._tile_px
         while True:
             try:
-                return tiled(color_rgb, self._infer, tile)
+                return Known(*tiled(color_rgb, self._infer, tile))
             except (MemoryError, RuntimeError) as error:
                 if not _is_memory(error):
                     raise
@@ -109,17 +108,20 @@ class UNetSegmenter:
                     raise MemoryError(str(error)) from error
                 tile //= 2
 
-    def _infer(self, color_rgb: UInt8Array) -> Float32Array:
+    def _infer(self, color_rgb: UInt8Array) -> tuple[Float32Array, ...]:
+        """Return the maps and the features (K, h / 2, w / 2) of a part (h, w, 3) of a picture."""
+        height, width = (size // STRIDE for size in color_rgb.shape[:2])
         with torch.inference_mode():
-            picture = normalised(color_rgb[None]).to(
+            picture = normalised(padded(color_rgb)[None]).to(
                 self._device, memory_format=torch.channels_last
             )
             kind = self._device.split(":")[0]
             with torch.autocast(kind, torch.bfloat16, enabled=self._bfloat16):
-                output = self._network.known(picture)
-        # Rearranged before it is widened: half as much to move.
-        known: Float32Array = output[0].cpu().contiguous().float().numpy()
-        return known
+                maps, features = self._network.known(picture)
+            maps = maps[:, :height, :width].contiguous()
+            return tuple(
+                part.cpu().float().numpy() for part in (maps, features[:, :height, :width])
+            )
 
 
 def _is_memory(error: MemoryError | RuntimeError) -> bool:
@@ -127,18 +129,13 @@ def _is_memory(error: MemoryError | RuntimeError) -> bool:
     return known or "allocate memory" in str(error)
 
 
-def maps_in(known: Float32Array) -> Float32Array:
-    """Return the maps (8, h, w) in what is known (K, h, w)."""
-    return known[: len(Maps._fields)]
-
-
 def instances_of(
-    known: Float32Array, size: tuple[int, int], model: Model, *, bfloat16: bool = False
+    known: Known, size: tuple[int, int], model: Model, *, bfloat16: bool = False
 ) -> list[BranchMask]:
-    """Return the branches in what is known (K, h, w) of a picture of a size (height, width)."""
-    candidates = candidates_of(maps_in(known), model.grouping)
+    """Return the branches in what is known of a picture of a size (height, width)."""
+    candidates = candidates_of(known.maps, model.grouping)
     scores = model.scorer.scores(known, candidates, bfloat16=bfloat16)
-    strands, taken = chosen(maps_in(known), candidates, scores, model.grouping)
+    strands, taken = chosen(known.maps, candidates, scores, model.grouping)
     return masks_of(strands, taken, size, model.least_score)
 
 

@@ -26,27 +26,35 @@ def enlarged(color_rgb: UInt8Array, zoom: float) -> UInt8Array:
 
 
 def tiled(
-    color_rgb: UInt8Array, infer: Callable[[UInt8Array], Float32Array], tile_px: int
-) -> Float32Array:
-    """Return the (K, H / 2, W / 2) that come of an (H, W, 3) picture, H and W even.
+    color_rgb: UInt8Array, infer: Callable[[UInt8Array], tuple[Float32Array, ...]], tile_px: int
+) -> tuple[Float32Array, ...]:
+    """Return what the network says of an (H, W, 3) picture, H and W even.
 
-    infer: runs the network on a picture of `MULTIPLE_PX`; the edge is continued up to that.
+    infer: says it, in arrays (K, h / 2, w / 2), of a part (h, w, 3) of the picture.
     """
     height, width = color_rgb.shape[:2]
-    out = np.empty((0, height // STRIDE, width // STRIDE), dtype=np.float32)
+    if max(height, width) <= tile_px:
+        return infer(color_rgb)
+    out: list[Float32Array] = []
     for rows, own_rows in _spans(height, tile_px):
         for columns, own_columns in _spans(width, tile_px):
-            part = infer(_padded(color_rgb[rows, columns]))
-            if not len(out):
-                out = np.empty((len(part), *out.shape[1:]), dtype=np.float32)
+            parts = infer(color_rgb[rows, columns])
+            if not out:
+                out = [_as_laid_out(part, height // STRIDE, width // STRIDE) for part in parts]
             top, left = rows.start // STRIDE, columns.start // STRIDE
-            target = out[:, own_rows, own_columns]
             i, j = own_rows.start - top, own_columns.start - left
-            target[:] = part[:, i : i + target.shape[1], j : j + target.shape[2]]
-    return out
+            for whole, part in zip(out, parts, strict=True):
+                target = whole[:, own_rows, own_columns]
+                target[:] = part[:, i : i + target.shape[1], j : j + target.shape[2]]
+    return tuple(out)
 
 
-def _padded(color_rgb: UInt8Array) -> UInt8Array:
+def _as_laid_out(part: Float32Array, height: int, width: int) -> Float32Array:
+    return np.empty_like(part, order="K", shape=(len(part), height, width))
+
+
+def padded(color_rgb: UInt8Array) -> UInt8Array:
+    """Return an (H, W, 3) picture whose edge is continued up to `MULTIPLE_PX`."""
     bottom, right = (-size % MULTIPLE_PX for size in color_rgb.shape[:2])
     return np.pad(color_rgb, ((0, bottom), (0, right), (0, 0)), mode="edge")
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canopy_skel.segmenters.unet.grouping import Candidates
-from canopy_skel.segmenters.unet.network import Maps
+from canopy_skel.segmenters.unet.network import Known, Maps
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.scorer import (
     ACROSS,
@@ -40,7 +40,7 @@ def bar(angle_deg, length):
     known[MAP["middle_u"]], known[MAP["middle_v"]] = share * c, share * s
     known[MAP["log_length"]] = np.log(2 * length)
     known[-2:] = 7.0
-    return known, np.flatnonzero(inside)
+    return Known(known[:-FEATURES], known[-FEATURES:]), np.flatnonzero(inside)
 
 
 def candidates(*cells):
@@ -135,9 +135,9 @@ def test_bfloat16_scores_nearly_the_same():
 
 def test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture():
     known, cells = bar(20, 60)
-    known[MAP["branch"], 30:50, 90:110] = 3.0
-    across = known[:, ::-1].copy()
-    across[[MAP["sine"], MAP["middle_v"]]] *= -1
+    known.maps[MAP["branch"], 30:50, 90:110] = 3.0
+    across = Known(known.maps[:, ::-1].copy(), known.features[:, ::-1])
+    across.maps[[MAP["sine"], MAP["middle_v"]]] *= -1
     place = np.zeros(SIZE, bool)
     place.ravel()[cells] = True
     (strip,) = strips_of(known, candidates(cells))

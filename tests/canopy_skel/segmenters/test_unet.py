@@ -19,7 +19,7 @@ from canopy_skel.segmenters.unet.grouping import Grouping, Strands
 from canopy_skel.segmenters.unet.network import UNet
 from canopy_skel.segmenters.unet.portable import PortableNetwork
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
-from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, maps_in, masks_of
+from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, masks_of
 from canopy_skel.segmenters.unet.weights import Model, load
 
 DEMO = Path(__file__).parents[3] / "recordings/demo_apple.mcap"
@@ -114,13 +114,15 @@ def test_segmenting_keeps_to_one_core_however_many_there_are():
 @pytest.mark.parametrize("size", [(1, 1), (3, 500), (97, 131), (64, 64)])
 def test_pictures_of_any_size_are_known_at_half_of_it_enlarged(untrained, size, zoom):
     known = UNetSegmenter(replace(untrained, zoom=zoom)).known(noise(*size))
-    assert known.shape == (8 + 8, ceil(size[0] * zoom / 2), ceil(size[1] * zoom / 2))
-    assert np.isfinite(known).all()
+    grid = ceil(size[0] * zoom / 2), ceil(size[1] * zoom / 2)
+    assert known.maps.shape == (8, *grid)
+    assert known.features.shape == (untrained.channels[0], *grid)
+    assert all(np.isfinite(part).all() for part in known)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (31, 500), (240, 320)])
 def test_without_torch_the_built_in_network_says_the_same(builtin, size):
-    expected = maps_in(builtin.known(noise(*size)))
+    expected = builtin.known(noise(*size)).maps
     maps = PortableNetwork().maps(noise(*size))
     assert maps.shape == expected.shape
     assert np.allclose(maps, expected, atol=1e-3)
@@ -164,11 +166,16 @@ def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
     assert [mask.confidence for mask in masks] == [0.4, 0.9]
 
 
+def assert_same(one, other):
+    for part, expected in zip(one, other, strict=True):
+        assert np.allclose(part, expected, atol=1e-4)
+
+
 def test_tiles_fit_together_without_a_seam(untrained):
     picture = noise(500, 700)
     whole = UNetSegmenter(untrained).known(picture)
     tiled = UNetSegmenter(untrained, tile_px=320).known(picture)
-    assert np.allclose(whole, tiled, atol=1e-4)
+    assert_same(whole, tiled)
 
 
 def test_where_memory_runs_out_tiles_are_made_smaller(untrained, monkeypatch):
@@ -185,7 +192,7 @@ def test_where_memory_runs_out_tiles_are_made_smaller(untrained, monkeypatch):
         return infer(self, color)
 
     monkeypatch.setattr(UNetSegmenter, "_infer", scarce)
-    assert np.allclose(segmenter.known(picture), whole, atol=1e-4)
+    assert_same(segmenter.known(picture), whole)
     assert max(seen) > 800
     assert min(seen) <= 768
 
@@ -229,10 +236,10 @@ def test_the_number_of_threads_is_bounded(untrained):
 @pytest.mark.skipif(not has_fast_bfloat16(), reason="this CPU has no bfloat16 arithmetic")
 def test_bfloat16_says_nearly_the_same(untrained):
     picture = noise(200, 300)
-    exact = UNetSegmenter(untrained).known(picture)
-    rough = UNetSegmenter(untrained, bfloat16=True).known(picture)
-    assert np.abs(exact - rough).mean() < 0.05 * np.abs(exact).mean()
-    assert not np.array_equal(exact, rough)
+    both = [UNetSegmenter(untrained, bfloat16=fast).known(picture) for fast in (False, True)]
+    for exact, rough in zip(*both, strict=True):
+        assert np.abs(exact - rough).mean() < 0.05 * np.abs(exact).mean()
+        assert not np.array_equal(exact, rough)
 
 
 def test_bfloat16_is_refused_where_the_cpu_lacks_it(untrained, monkeypatch):

@@ -7,7 +7,7 @@ from scenes.drawn import drawn, straight
 from scenes.scorers import constant_scorer
 
 from canopy_skel.segmenters.unet.grouping import Grouping
-from canopy_skel.segmenters.unet.network import Maps, UNet
+from canopy_skel.segmenters.unet.network import Known, Maps, UNet
 from canopy_skel.segmenters.unet.scorer import ACROSS, ALONG, BESIDE
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter
 from canopy_skel.segmenters.unet.targets import places_of, targets_of
@@ -94,7 +94,7 @@ def test_examples_are_strands_with_what_they_share_with_the_labels(model, monkey
     known[2], known[3] = np.cos(angle), np.sin(angle)
     known[4] = np.log(7)
     known[5:8] = places_of(targets).transpose(2, 0, 1)
-    monkeypatch.setattr(UNetSegmenter, "known", lambda self, color: known)
+    monkeypatch.setattr(UNetSegmenter, "known", lambda self, color: Known(known[:8], known[8:]))
     both = examples_of(model, [image])
     assert both.strips.shape == (2, KNOWN + BESIDE, ALONG, ACROSS)
     assert (both.overlap > 0.8).all()
