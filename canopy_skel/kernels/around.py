@@ -65,9 +65,10 @@ def ring_figures(ring: Floats32, lightness: float, z: float, row: Floats32) -> N
     row[4] = max(ring[c, 1], ring[d, 1]) - lightness
     row[5] = min(ring[c, 1], ring[d, 1]) - lightness
     row[6] = same / DIRECTIONS
-    row[7] = (abs(ring[a, 2] - z) <= tolerance_m) + (abs(ring[b, 2] - z) <= tolerance_m)
-    row[8] = (ring[c, 2] - z > tolerance_m) + (ring[d, 2] - z > tolerance_m)
-    row[9] = (ring[c, 2] == 0.0) + (ring[d, 2] == 0.0)
+    # Python's own true and true are two; NumPy's, where nothing is compiled, are one.
+    row[7] = int(abs(ring[a, 2] - z) <= tolerance_m) + int(abs(ring[b, 2] - z) <= tolerance_m)
+    row[8] = int(ring[c, 2] - z > tolerance_m) + int(ring[d, 2] - z > tolerance_m)
+    row[9] = int(ring[c, 2] == 0.0) + int(ring[d, 2] == 0.0)
     row[10] = masked / DIRECTIONS
     row[11] = max(ring[a, 3], ring[b, 3])
 

@@ -200,7 +200,7 @@ def chains(link: I32) -> tuple[I32, I64]:
     filled = 0
     for rings in (False, True):
         for first in range(count):
-            degree = (link[first, 0] >= 0) + (link[first, 1] >= 0)
+            degree = int(link[first, 0] >= 0) + int(link[first, 1] >= 0)
             if seen[first] or (degree == 2 and not rings):
                 continue
             here = first

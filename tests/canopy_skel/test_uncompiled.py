@@ -21,7 +21,6 @@ SMALL = (
     "segmenters/test_grouping.py::test_branches_that_touch_side_by_side_are_two",
     "segmenters/test_grouping.py::test_at_a_fork_the_straightest_way_goes_on",
 )
-# Moved by 0.12, not by 0.1: so regular a scene has places that tie but for rounding.
 CANOPY = """
 import json, sys
 sys.path.insert(0, "tests")
@@ -30,7 +29,7 @@ from canopy_skel.pipeline import MethodConfig, Skeletonizer
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 maker = Skeletonizer(RecordedSegmenter(), MethodConfig(name="canopy"))
 for index in range(2):
-    maker.add_view(leafy_view(index, y=0.12 * index))
+    maker.add_view(leafy_view(index, y=0.1 * index))
 graph = maker.skeleton().graph
 print(json.dumps([graph.vertices_in_base.tolist(), graph.edges.tolist()]))
 """
