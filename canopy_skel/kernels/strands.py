@@ -59,9 +59,11 @@ def _joins_nothing(core: Bool, i: int, j: int) -> bool:
 @inner("boolean(boolean[:,::1], int64, int64, boolean)")
 def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
     """Say whether a cell may go in this half of a round of Guo and Hall (1989)."""
-    p2, p3, p4 = core[i - 1, j], core[i - 1, j + 1], core[i, j + 1]
-    p5, p6, p7 = core[i + 1, j + 1], core[i + 1, j], core[i + 1, j - 1]
-    p8, p9 = core[i, j - 1], core[i - 1, j - 1]
+    p2, p4, p6, p8 = core[i - 1, j], core[i, j + 1], core[i + 1, j], core[i, j - 1]
+    if p2 and p4 and p6 and p8:  # most are: deep within
+        return False
+    p3, p5 = core[i - 1, j + 1], core[i + 1, j + 1]
+    p7, p9 = core[i + 1, j - 1], core[i - 1, j - 1]
     one = int(p9 or p2) + int(p3 or p4) + int(p5 or p6) + int(p7 or p8)
     two = int(p2 or p3) + int(p4 or p5) + int(p6 or p7) + int(p8 or p9)
     if min(one, two) > 3 or not _joins_nothing(core, i, j):
@@ -71,18 +73,45 @@ def _removable(core: Bool, i: int, j: int, second: bool) -> bool:
     return not ((p6 or p7 or not p9) and p8)
 
 
-@inner("int64(boolean[:,::1], int32[:,::1], boolean[::1], int64)")
-def _swept(core: Bool, live: I32, marked: Bool, count: int) -> int:
-    """Take marked cells out of the core and of the list of live ones; return how many are left."""
-    kept = 0
+@inner("int64(boolean[:,::1], int32[:,::1], int64, int64, boolean[:,::1], int32[:,::1])")
+def _beside(core: Bool, gone: I32, begin: int, end: int, listed: Bool, out: I32) -> int:
+    """List the cells of the core beside gone[begin:end] once each; return how many.
+
+    listed: (h, w), all False.
+    """
+    count = 0
+    for k in range(begin, end):
+        for i in range(gone[k, 0] - 1, gone[k, 0] + 2):
+            for j in range(gone[k, 1] - 1, gone[k, 1] + 2):
+                if core[i, j] and not listed[i, j]:
+                    listed[i, j] = True
+                    out[count, 0], out[count, 1] = i, j
+                    count += 1
     for k in range(count):
-        i, j = live[k, 0], live[k, 1]
-        if marked[k]:
-            core[i, j] = False
-        else:
-            live[kept, 0], live[kept, 1] = i, j
-            kept += 1
-    return kept
+        listed[out[k, 0], out[k, 1]] = False
+    return count
+
+
+@inner("void(boolean[:,::1], int32[:,::1])")
+def _peeled(core: Bool, cells: I32) -> None:
+    """Take off the core (h, w), which has these cells, all that Guo and Hall take off."""
+    asked, gone = cells.copy(), np.empty(cells.shape, dtype=np.int32)
+    listed = np.zeros(core.shape, dtype=np.bool_)
+    half, count = 0, len(cells)
+    before, begin, end = 0, 0, 0
+    while half < 2 or count > 0:
+        for k in range(count):
+            i, j = asked[k]
+            if core[i, j] and _removable(core, i, j, half % 2 == 1):
+                gone[end, 0], gone[end, 1] = i, j
+                end += 1
+        for k in range(begin, end):
+            core[gone[k, 0], gone[k, 1]] = False
+        half += 1
+        # What could not go in this kind of half may once something beside it has gone since.
+        if half > 1:
+            count = _beside(core, gone, before, end, listed, asked)
+        before, begin = begin, end
 
 
 @kernel("int32[:,::1](boolean[:,::1])")
@@ -92,58 +121,69 @@ def thinned(core: Bool) -> I32:
     Its outermost cells must be False. No line gets shorter than half its width.
     """
     height, width = core.shape
-    live = np.empty((core.size, 2), dtype=np.int32)
+    cells = np.empty((core.size, 2), dtype=np.int32)
     count = 0
     for i in range(1, height - 1):
         for j in range(1, width - 1):
             if core[i, j]:
-                live[count, 0], live[count, 1] = i, j
+                cells[count, 0], cells[count, 1] = i, j
                 count += 1
-    marked = np.zeros(count, dtype=np.bool_)
-    changed = True
-    while changed:
-        changed = False
-        for second in (False, True):
-            for k in range(count):
-                marked[k] = _removable(core, live[k, 0], live[k, 1], second)
-            before, count = count, _swept(core, live, marked, count)
-            changed = changed or count < before
+    _peeled(core, cells[:count])
+    kept = 0
     for k in range(count):
-        marked[k] = _joins_nothing(core, live[k, 0], live[k, 1])
-        if marked[k]:
-            core[live[k, 0], live[k, 1]] = False
-    count = _swept(core, live, marked, count)
-    return live[:count].copy()
+        i, j = cells[k]
+        if core[i, j] and _joins_nothing(core, i, j):
+            core[i, j] = False
+        if core[i, j]:
+            cells[kept, 0], cells[kept, 1] = i, j
+            kept += 1
+    return cells[:kept].copy()
 
 
-@inner("float64(float32[:,:,::1], int32[::1], int32[::1], float64, float64[::1])")
-def _price(maps: F32, a: I32, b: I32, window: float, gate: F64) -> float:
+@inner("float64[:,::1](int32[:,::1], float32[:,:,::1])")
+def _courses(cells: I32, maps: F32) -> F64:
+    """Return what `_price` asks of cells, (N, 7).
+
+    Cosine and sine of the angle and of twice it (as in the maps, not scaled), logarithm of the
+    radius, the radius, how far aside a link may jump.
+    """
+    out = np.empty((len(cells), 7))
+    for k in range(len(cells)):
+        i, j = cells[k]
+        x, y, log_radius = maps[0, i, j], maps[1, i, j], maps[2, i, j]
+        angle = 0.5 * np.arctan2(y, x)
+        radius = np.exp(log_radius)
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = np.cos(angle), np.sin(angle), x, y
+        out[k, 4], out[k, 5], out[k, 6] = log_radius, radius, max(ACROSS * radius, 1.5)
+    return out
+
+
+@inner("float64(int32[:,::1], float64[:,::1], int64, int64, float64, float64[::1])")
+def _price(cells: I32, courses: F64, a: int, b: int, window: float, gate: F64) -> float:
     """Return what it costs to go from cell a to b, inf if it is out of the question.
 
     The sign says whether b lies ahead of a. gate: least cosine of twice the angle between them,
     largest logarithmic ratio of their radii.
     """
-    x, y, log_radius = maps[0, a[0], a[1]], maps[1, a[0], a[1]], maps[2, a[0], a[1]]
-    v, w = maps[0, b[0], b[1]], maps[1, b[0], b[1]]
-    angle = 0.5 * np.arctan2(y, x)
-    c, s = np.cos(angle), np.sin(angle)
-    du, dv = b[1] - a[1], b[0] - a[0]
+    c, s = courses[a, 0], courses[a, 1]
+    du, dv = cells[b, 1] - cells[a, 1], cells[b, 0] - cells[a, 0]
     along, across = c * du + s * dv, abs(c * dv - s * du)
-    aside = max(ACROSS * np.exp(log_radius), 1.5)
     spread = 1.0 if abs(du) <= 1 and abs(dv) <= 1 else 0.5
-    if abs(along) < 0.3 or abs(along) > window or across > min(aside, 0.3 + spread * abs(along)):
+    most = min(courses[a, 6], 0.3 + spread * abs(along))
+    if abs(along) < 0.3 or abs(along) > window or across > most:
         return np.inf
+    x, y, v, w = courses[a, 2], courses[a, 3], courses[b, 2], courses[b, 3]
     cosine = (x * v + y * w) / (np.sqrt((x * x + y * y) * (v * v + w * w)) + 1e-9)
-    if cosine < gate[0] or abs(maps[2, b[0], b[1]] - log_radius) > gate[1]:
+    if cosine < gate[0] or abs(courses[b, 4] - courses[a, 4]) > gate[1]:
         return np.inf
     price = abs(along) + 2.0 * across + 4.0 * (1.0 - cosine)
     return float(price if along > 0 else -price)
 
 
-@inner("int64(float32, int64)")
-def _window(log_radius: float, tries: int) -> int:
+@inner("int64(float64, int64)")
+def _window(radius: float, tries: int) -> int:
     """Return how far to look for the next cell; farther with each try."""
-    return int(min(max(1.0 + 1.5 * ACROSS * np.exp(log_radius), 2.0) + tries, 9.0))
+    return int(min(max(1.0 + 1.5 * ACROSS * radius, 2.0) + tries, 9.0))
 
 
 @kernel("int32[:,::1](int32[:,::1], int32[:,::1], float32[:,:,::1], float64[::1], int64)")
@@ -157,24 +197,25 @@ def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
     height, width = number.shape
     link = np.full((len(cells), 2), -1, dtype=np.int32)
     best = np.empty((len(cells), 2), dtype=np.int32)
+    courses, cost = _courses(cells, maps), np.empty(2)
     for attempt in range(tries):
         best[:] = -1
         for k in range(len(cells)):
             i, j = cells[k]
             if link[k, 0] >= 0 and link[k, 1] >= 0:
                 continue
-            window = _window(maps[2, i, j], attempt)
-            cost = np.full(2, np.inf)
+            window = _window(courses[k, 5], attempt)
+            cost[:] = np.inf
             for a in range(max(i - window, 0), min(i + window + 1, height)):
                 for b in range(max(j - window, 0), min(j + window + 1, width)):
                     n = number[a, b]
                     if n < 0 or n == k or n == link[k, 0] or n == link[k, 1]:
                         continue
-                    price = _price(maps, cells[k], cells[n], window, gate)
+                    price = _price(cells, courses, k, n, window, gate)
                     side = 1 if price > 0 else 0
                     if abs(price) >= cost[side] or link[k, side] >= 0:
                         continue
-                    back = 1 if _price(maps, cells[n], cells[k], 99.0, gate) > 0 else 0
+                    back = 1 if _price(cells, courses, n, k, 99.0, gate) > 0 else 0
                     if link[n, back] < 0:
                         cost[side], best[k, side] = abs(price), n
         for k in range(len(cells)):

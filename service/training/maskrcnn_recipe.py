@@ -12,9 +12,10 @@ from canopy_skel.segmenters.maskrcnn.segmenter import MaskRcnnSegmenter
 from canopy_skel.segmenters.maskrcnn.weights import Detector, load, save
 from service.evaluation import evaluate
 from service.training.maskrcnn import MaskRcnnPlan, train_maskrcnn
+from service.training.scoring import Progress
 from service.training.store import StoredImages
 from service.training.user_pictures import UserPicture
-from service.training.user_recipe import Imported, Progress, import_pictures
+from service.training.user_recipe import Imported, import_pictures
 
 
 def initial(path: Path | None, size_px: tuple[int, int] = SIZE_PX) -> Detector:

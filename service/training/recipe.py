@@ -3,7 +3,7 @@
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from math import inf
@@ -29,7 +29,7 @@ from service.training.judging import (
 )
 from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
-from service.training.scoring import examples_of, taught
+from service.training.scoring import Progress, examples_of, taught
 from service.training.store import StoredImages
 
 WANTED_PRECISION = 0.88
@@ -37,8 +37,6 @@ _TAUGHT_STEPS, _FURTHER_STEPS = 6000, 1500
 """The scorer learns so long, anew or on from another; no more steps than the network did."""
 _AS_MUCH = 0.01
 """Networks whose overlap with wood differs by less see as much."""
-_TAUGHT_EVERY = 2
-"""The scorer of the recipe learns from every second picture."""
 BUILTIN_PLANS = (
     Plan(steps=8400, look_every=300, centre_weight=0.5, piece_weight=0.0),
     Plan(
@@ -57,8 +55,6 @@ Only the second learns where in its piece a cell lies; more of a piece shows in 
 ZOOM = 1.25
 """Networks see pictures this much enlarged: the same weights find a tenth more (docs/unet.md)."""
 
-Progress = Callable[[str, int, int], None]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Halves:
@@ -66,6 +62,22 @@ class Halves:
 
     choose: Sequence[LabelledImage]
     report: Sequence[LabelledImage]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Lessons:
+    """What a scorer learns from: `count` pictures, from the scorer `init` on; None: anew."""
+
+    pictures: Iterable[LabelledImage]
+    count: int
+    init: Scorer | None
+    progress: Progress
+
+    def shown(self) -> Iterator[LabelledImage]:
+        """Yield the pictures, telling how many have been."""
+        for number, picture in enumerate(self.pictures):
+            yield picture
+            self.progress("strands", number + 1, self.count)
 
 
 def choosing(images: StoredImages) -> list[int]:
@@ -115,9 +127,10 @@ def builtin_weights(
             return look(network)
 
         train(run, lambda: pictures, own, looked)
-    lessons = (without_small(pictures[k]) for k in range(0, len(pictures), _TAUGHT_EVERY))
     last = folder / f"run{len(runs)}"
-    model, facts = finish(runs[-1], last, lessons, None, halves_of(validate))
+    seen = (without_small(pictures[k]) for k in range(len(pictures)))
+    lessons = Lessons(pictures=seen, count=len(pictures), init=None, progress=progress)
+    model, facts = finish(runs[-1], last, lessons, halves_of(validate))
     facts["training"] |= {
         "plan": [run.plan.fields() for run in runs],
         "steps": sum(run.step for run in runs),
@@ -150,13 +163,10 @@ def shortened(plans: Sequence[Plan], steps: int | None, minutes: float | None) -
 def finish(
     run: Run,
     folder: Path,
-    lessons: Iterable[LabelledImage],
-    init: Scorer | None,
+    lessons: Lessons,
     halves: Halves,
 ) -> tuple[Model, dict[str, Any]]:
     """Take the averages that looked best, teach the scorer, make it honest, and measure.
-
-    lessons: pictures the scorer learns from, from `init` on.
 
     Raises:
         UsageError: the folder holds no averaged weights.
@@ -164,7 +174,7 @@ def finish(
     path = best_of(folder)
     network = UNet(run.plan.channels)
     network.load_state_dict(torch.load(path, weights_only=True))
-    model = with_scorer(network, run.step, lessons, init, ZOOM, Grouping())
+    model = with_scorer(network, run.step, lessons, ZOOM, Grouping())
     chosen = judgements_of(model, halves.choose)
     correction = honest(chosen)
     least = threshold(corrected(chosen, correction), WANTED_PRECISION)
@@ -191,8 +201,7 @@ def finish(
 def with_scorer(
     network: UNet,
     steps: int,
-    lessons: Iterable[LabelledImage],
-    init: Scorer | None,
+    lessons: Lessons,
     zoom: float,
     grouping: Grouping,
 ) -> Model:
@@ -205,8 +214,9 @@ def with_scorer(
         scorer=untaught_scorer(network.channels),
         least_score=0.0,
     )
-    most = _TAUGHT_STEPS if init is None else _FURTHER_STEPS
-    scorer = taught(examples_of(model, lessons), min(steps, most), init)
+    most = _TAUGHT_STEPS if lessons.init is None else _FURTHER_STEPS
+    examples = examples_of(model, lessons.shown())
+    scorer = taught(examples, min(steps, most), lessons.init, lessons.progress)
     return replace(model, scorer=scorer)
 
 

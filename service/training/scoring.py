@@ -1,13 +1,12 @@
 """Teaching the scorer which strands are branches, piece for piece as they are labelled."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from canopy_skel.geometry import FloatArray
@@ -35,6 +34,10 @@ from canopy_skel.segmenters.unet.scorer import (
 from canopy_skel.segmenters.unet.segmenter import UNetSegmenter, masks_of
 from canopy_skel.segmenters.unet.weights import Model
 
+Progress = Callable[[str, int, int], None]
+"""Told what is done, how much of it, and of how much."""
+
+_TOLD_EVERY = 100
 _BATCH = 256
 _PEAK_RATE, _GENTLE_RATE, _DECAY = 2e-3, 3e-4, 1e-2
 _SOFT = 0.15
@@ -87,7 +90,12 @@ def _masks(
     return masks
 
 
-def taught(examples: Examples, steps: int, init: Scorer | None = None) -> Scorer:
+def taught(
+    examples: Examples,
+    steps: int,
+    init: Scorer | None = None,
+    progress: Progress = lambda name, done, total: None,
+) -> Scorer:
     """Return a scorer fitted to examples; from `init` on, or from random weights.
 
     Without examples it is `init`, or says one half of everything. One that never saw any example
@@ -95,28 +103,30 @@ def taught(examples: Examples, steps: int, init: Scorer | None = None) -> Scorer
     """
     torch.manual_seed(_SEED)
     scorer = Scorer(examples.strips.shape[1] - BESIDE) if init is None else copy.deepcopy(init)
+    if not len(examples.overlap):
+        return scorer.eval()
     known_well = bool(scorer.seen)
-    if len(examples.overlap):
-        if not known_well:
-            _standardise(scorer, examples)
-        peak = _GENTLE_RATE if known_well else _PEAK_RATE
-        for seed, judge in enumerate(scorer.judges):
-            _teach(scorer, judge, examples, steps, peak, seed)
+    if not known_well:
+        _standardise(scorer, examples)
+    peak = _GENTLE_RATE if known_well else _PEAK_RATE
+    for number in range(len(scorer.judges)):
+        _teach(scorer, number, examples, steps, peak, progress)
     return scorer.eval()
 
 
 def _teach(
-    scorer: Scorer, judge: nn.Module, examples: Examples, steps: int, peak: float, seed: int
+    scorer: Scorer, number: int, examples: Examples, steps: int, peak: float, progress: Progress
 ) -> None:
     """Fit one judge of a scorer to examples, in place; the others do not count."""
-    rng = np.random.default_rng(seed)
-    torch.manual_seed(seed)
-    judge.train()
+    rng = np.random.default_rng(number)
+    torch.manual_seed(number)
+    judge = scorer.judges[number].train()
+    before, total = number * steps, len(scorer.judges) * steps
     wanted = np.clip((examples.overlap - LEAST_OVERLAP) / (2 * _SOFT) + 0.5, 0.0, 1.0)
     optimiser = torch.optim.AdamW(judge.parameters(), lr=peak, weight_decay=_DECAY)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, peak, total_steps=steps)
     fast = has_fast_bfloat16()
-    for _ in range(steps):
+    for step in range(steps):
         chosen = rng.integers(len(wanted), size=_BATCH)
         strips = torch.from_numpy(examples.strips[chosen].astype(np.float32))
         along, across = (rng.random(2) < 0.5).tolist()
@@ -128,6 +138,8 @@ def _teach(
         loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         optimiser.step()
         rate.step()
+        if (step + 1) % _TOLD_EVERY == 0 or step + 1 == steps:
+            progress("scorer", before + step + 1, total)
 
 
 def _standardise(scorer: Scorer, examples: Examples) -> None:

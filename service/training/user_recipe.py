@@ -2,7 +2,7 @@
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from canopy_skel.segmenters.unet.grouping import Grouping
 from canopy_skel.segmenters.unet.weights import Model, save
 from service.training.look import Look
 from service.training.loop import Plan, Run, resume, start, train
-from service.training.recipe import ZOOM, Halves, finish, with_scorer
+from service.training.recipe import ZOOM, Halves, Lessons, finish, with_scorer
+from service.training.scoring import Progress
 from service.training.store import StoredImages, store
 from service.training.user_pictures import UserPicture, labelled, split
 
@@ -25,8 +26,6 @@ SCRATCH_PLAN = Plan(steps=8000)
 ENOUGH_INSTANCES = 60
 """To choose, calibrate and set a threshold on; with fewer, those of the initial weights stay."""
 _NAMED = 3
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -123,7 +122,9 @@ def user_weights(
     shown = validate if len(validate) else train_set
     look = Look(shown, range(min(len(shown), 20)), ZOOM)
     train(run, lambda: train_set, folder / "run", look)
-    lessons = (train_set[k] for k in range(len(train_set)))
+    scorer = None if init is None else init.scorer
+    seen = (train_set[k] for k in range(len(train_set)))
+    lessons = Lessons(pictures=seen, count=len(train_set), init=scorer, progress=progress)
     judged = [validate[k] for k in range(len(validate))]
     model, facts = _finished(run, folder / "run", lessons, judged, init)
     facts["training"] |= {"pictures": len(train_set), "scans": imported.scans}
@@ -144,7 +145,7 @@ def _digest(labels: Path, state: Mapping[str, Tensor] | None) -> str:
 def _finished(
     run: Run,
     folder: Path,
-    lessons: Iterable[LabelledImage],
+    lessons: Lessons,
     validate: Sequence[LabelledImage],
     init: Model | None,
 ) -> tuple[Model, dict[str, Any]]:
@@ -153,17 +154,16 @@ def _finished(
     On the pictures the network has learned by heart nearly every strand is right; without others to
     set it right the scorer would be too sure.
     """
-    scorer = None if init is None else init.scorer
     if sum(len(image.lines) for image in validate) >= ENOUGH_INSTANCES:
         halves = Halves(choose=validate, report=validate)
-        model, facts = finish(run, folder, lessons, scorer, halves)
+        model, facts = finish(run, folder, lessons, halves)
         facts["validation"]["kind"] = (
             "the user's pictures of scans not trained on; threshold and calibration were set on"
             " them too, so expect a little less elsewhere"
         )
         return model, facts
     if init is None:
-        model = with_scorer(run.averaged, run.step, lessons, None, ZOOM, Grouping())
+        model = with_scorer(run.averaged, run.step, lessons, ZOOM, Grouping())
         model = replace(model, least_score=0.5)
     else:
         model = replace(init, network=run.averaged.eval())

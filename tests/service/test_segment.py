@@ -211,6 +211,29 @@ def test_labels_judge_and_train(canopy, labelme, tmp_path, weights):
     assert "checkpoint.pt: was trained on other labels, or began with other weights" in stderr
 
 
+def test_training_from_nothing_gives_weights_that_segment_and_are_gone_on_from(
+    canopy, labelme, tmp_path
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    code, stdout, _ = canopy(
+        "train", "--labelme", labelme, "--init", "none", "--steps", "2", "-o", first
+    )
+    assert code == 0
+    assert "unet.pt: trained for 2 steps" in stdout
+    weights = first / "unet.pt"
+    code, _, _ = canopy(
+        "segment", labelme / "tree0_0.png", "--weights", weights, "-o", tmp_path / "found"
+    )
+    assert code == 0
+    code, _, _ = canopy(
+        "train", "--labelme", labelme, "--init", weights, "--steps", "1", "-o", second
+    )
+    assert code == 0
+    before, after = (load(folder / "unet.pt").network.state_dict() for folder in (first, second))
+    assert before.keys() == after.keys()
+    assert any(not torch.equal(before[name], value) for name, value in after.items())
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -39,19 +39,19 @@ class _Judge(nn.Module):
         width, wide = _WIDTH, 2 * _WIDTH
         self.look = nn.Sequential(
             nn.Conv2d(channels, width, 3, (2, 1), 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(width, width, 3, 2, 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(width, wide, 3, 2, 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(wide, wide, 3, 1, 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Flatten(),
         )
         self.decide = nn.Sequential(
             nn.Dropout(_DROPPED),
             nn.Linear(wide * (ALONG // 8) * (-(-ACROSS // 4)), _UNITS),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Dropout(_DROPPED),
             nn.Linear(_UNITS, 1),
         )
@@ -75,7 +75,7 @@ class Scorer(nn.Module):
     seen: Tensor
 
     def __init__(self, known: int) -> None:
-        """`known`: how many channels the large network knows, see `UNet.known`."""
+        """`known`: how many maps and features the large network has."""
         super().__init__()
         channels = known + BESIDE
         self.judges = nn.ModuleList(_Judge(channels) for _ in range(_JUDGES))
@@ -88,8 +88,7 @@ class Scorer(nn.Module):
     def forward(self, strips: Tensor) -> Tensor:
         """Return (N,) logits of (N, C, ALONG, ACROSS) strips, see `strips_of`."""
         views = [
-            self.standardised(mirrored(strips, along=turned, across=turned))
-            for turned in (False, True)
+            self.standardised(view) for view in (strips, mirrored(strips, along=True, across=True))
         ]
         said = [judge(view) for judge in self.judges for view in views]
         return self.seen * (self.slope * torch.stack(said).mean(dim=0) + self.shift)

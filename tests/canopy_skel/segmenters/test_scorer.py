@@ -3,8 +3,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes.bars import KNOWN, MAP, SIZE, bar, candidates
 
-from canopy_skel.segmenters.unet.grouping import Candidates
 from canopy_skel.segmenters.unet.network import Known, Maps
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
 from canopy_skel.segmenters.unet.scorer import (
@@ -15,36 +15,6 @@ from canopy_skel.segmenters.unet.scorer import (
     mirrored,
     strips_of,
 )
-
-SIZE = (120, 160)
-MAP = {name: place for place, name in enumerate(Maps._fields)}
-FEATURES = 2
-KNOWN = len(Maps._fields) + FEATURES
-MIDDLE = (80.0, 60.0)
-RADIUS_CELLS = 4.0
-
-
-def bar(angle_deg, length):
-    """Return what a network that knows it would say of a bar in the middle, and its cells."""
-    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
-    angle = np.radians(angle_deg)
-    c, s = np.cos(angle), np.sin(angle)
-    along = (u - MIDDLE[0]) * c + (v - MIDDLE[1]) * s
-    aside = (v - MIDDLE[1]) * c - (u - MIDDLE[0]) * s
-    inside = (abs(along) <= length / 2) & (abs(aside) <= RADIUS_CELLS)
-    share = -along / (length / 2)
-    known = np.zeros((KNOWN, *SIZE), np.float32)
-    known[MAP["branch"]] = np.where(inside, 4, -20)
-    known[MAP["cosine"]], known[MAP["sine"]] = np.cos(2 * angle), np.sin(2 * angle)
-    known[MAP["log_radius"]] = np.log(2 * RADIUS_CELLS)
-    known[MAP["middle_u"]], known[MAP["middle_v"]] = share * c, share * s
-    known[MAP["log_length"]] = np.log(2 * length)
-    known[-2:] = 7.0
-    return Known(known[:-FEATURES], known[-FEATURES:]), np.flatnonzero(inside)
-
-
-def candidates(*cells):
-    return Candidates(size=SIZE, cells=cells, way=np.zeros(len(cells), np.int64))
 
 
 @given(angle=st.floats(0, 180), length=st.floats(40, 70))
@@ -113,7 +83,7 @@ def test_scores_are_between_none_and_one_each_for_itself():
 def test_more_strands_than_fit_into_one_batch_are_all_scored():
     scorer = random_scorer()
     known, cells = bar(0, 60)
-    shorter = [cells[: 100 + k % 5] for k in range(600)]
+    shorter = [cells[: 60 + 20 * (k % 5)] for k in range(600)]
     scores = scorer.scores(known, candidates(*shorter))
     assert scores == pytest.approx(np.tile(scores[:5], 120), abs=1e-5)
     assert len(np.unique(scores[:5])) == 5
@@ -133,22 +103,37 @@ def test_bfloat16_scores_nearly_the_same():
     )
 
 
-def test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture():
-    known, cells = bar(20, 60)
-    known.maps[MAP["branch"], 30:50, 90:110] = 3.0
-    across = Known(known.maps[:, ::-1].copy(), known.features[:, ::-1])
-    across.maps[[MAP["sine"], MAP["middle_v"]]] *= -1
-    place = np.zeros(SIZE, bool)
-    place.ravel()[cells] = True
-    (strip,) = strips_of(known, candidates(cells))
-    (other,) = strips_of(across, candidates(np.flatnonzero(place[::-1])))
-    wanted = mirrored(torch.from_numpy(strip[None]), along=False, across=True)[0].numpy()
-    assert other[:-2] == pytest.approx(wanted[:-2], abs=1e-3)
-
-
 def test_a_score_is_the_same_from_either_end():
     scorer = random_scorer()
     strips = torch.randn(5, KNOWN + BESIDE, ALONG, ACROSS)
     with torch.inference_mode():
         turned = scorer(mirrored(strips, along=True, across=True))
         assert torch.allclose(turned, scorer(strips), atol=1e-5)
+
+
+def upside_down(known):
+    maps = known.maps[:, ::-1].copy()
+    maps[[MAP["sine"], MAP["middle_v"]]] *= -1
+    return Known(maps, known.features[:, ::-1])
+
+
+def turned_round(known):
+    maps = known.maps[:, ::-1, ::-1].copy()
+    maps[[MAP["middle_u"], MAP["middle_v"]]] *= -1
+    return Known(maps, known.features[:, ::-1, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("changed", "flip", "along"),
+    [(upside_down, np.s_[::-1], False), (turned_round, np.s_[::-1, ::-1], True)],
+)
+def test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture(changed, flip, along):
+    known, cells = bar(20, 60)
+    known.maps[MAP["branch"], 30:50, 90:110] = 3.0
+    known.features[0, 60:, :70] = 1.0
+    place = np.zeros(SIZE, bool)
+    place.ravel()[cells] = True
+    (strip,) = strips_of(known, candidates(cells))
+    (other,) = strips_of(changed(known), candidates(np.flatnonzero(place[flip])))
+    wanted = mirrored(torch.from_numpy(strip[None]), along=along, across=True)[0].numpy()
+    assert other[:-2] == pytest.approx(wanted[:-2], abs=1e-3)

@@ -34,16 +34,16 @@ def logits(scorer, strips):
 
 
 def test_a_scorer_learns_what_tells_right_from_wrong():
-    scorer = taught(examples(), 60)
+    scorer = taught(examples(), 30)
     others = examples(seed=1)
     right = others.overlap > 0.5
     assert ((logits(scorer, others.strips) > 0) == right).mean() > 0.95
-    again = taught(examples(), 60)
+    again = taught(examples(), 30)
     assert np.array_equal(logits(again, others.strips), logits(scorer, others.strips))
 
 
 def test_one_that_knows_already_is_gone_on_with_and_stays_as_it_was():
-    scorer = taught(examples(), 60)
+    scorer = taught(examples(), 30)
     before = {name: value.clone() for name, value in scorer.state_dict().items()}
     further = taught(examples(seed=2), 5, scorer)
     others = examples(seed=1)
@@ -63,7 +63,7 @@ def test_without_examples_a_scorer_stays_or_says_one_half():
 
 def test_one_that_never_saw_an_example_learns_as_a_new_one():
     none = Examples(strips=examples(4).strips[:0], overlap=np.zeros(0))
-    scorer = taught(examples(), 60, taught(none, 10))
+    scorer = taught(examples(), 30, taught(none, 10))
     others = examples(seed=1)
     assert ((logits(scorer, others.strips) > 0) == (others.overlap > 0.5)).mean() > 0.95
 
