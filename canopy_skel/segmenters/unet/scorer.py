@@ -115,11 +115,12 @@ class Scorer(nn.Module):
 
 def mirrored(strips: Tensor, *, along: bool, across: bool) -> Tensor:
     """Return (N, C, ALONG, ACROSS) strips as they were if the picture were mirrored."""
-    for wanted, axis, way in ((along, 2, "middle_u"), (across, 3, "middle_v")):
+    result = strips.flip([axis for axis, wanted in ((2, along), (3, across)) if wanted])
+    turned = {"middle_u": along, "middle_v": across, "sine": along != across}
+    for name, wanted in turned.items():
         if wanted:
-            strips = strips.flip(axis)
-            strips[:, [_MAP["sine"], _MAP[way]]] *= -1
-    return strips
+            result[:, _MAP[name]] *= -1
+    return result
 
 
 def strips_of(known: Known, candidates: Candidates) -> Float32Array:
