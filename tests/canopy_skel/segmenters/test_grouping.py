@@ -191,6 +191,47 @@ def test_thinning_keeps_what_hangs_together_and_leaves_lines(seed):
     assert full.mean() < 0.01
 
 
+def around_each(core):
+    """The eight neighbours of each cell, from above on clockwise."""
+    padded = np.pad(core, 1)
+    steps = [(-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1)]
+    height, width = core.shape
+    return [padded[1 + i : 1 + i + height, 1 + j : 1 + j + width] for i, j in steps]
+
+
+def joins_nothing(core):
+    p2, p3, p4, p5, p6, p7, p8, p9 = around_each(core)
+    corners = [~p2 & (p3 | p4), ~p4 & (p5 | p6), ~p6 & (p7 | p8), ~p8 & (p9 | p2)]
+    one = sum(a.astype(int) for a in (p9 | p2, p3 | p4, p5 | p6, p7 | p8))
+    two = sum(a.astype(int) for a in (p2 | p3, p4 | p5, p6 | p7, p8 | p9))
+    least = np.minimum(one, two)
+    return (sum(c.astype(int) for c in corners) == 1) & (least >= 2), least
+
+
+def thinned_as_written(core):
+    """Guo and Hall (1989), all cells at once in each half; then what joins nothing, in order."""
+    core, before = core.copy(), None
+    while before is None or not np.array_equal(core, before):
+        before = core.copy()
+        for second in (False, True):
+            p2, p3, p4, p5, p6, p7, p8, p9 = around_each(core)
+            stays = (p2 | p3 | ~p5) & p4 if second else (p6 | p7 | ~p9) & p8
+            may, least = joins_nothing(core)
+            core &= ~(may & (least <= 3) & ~stays)
+    for i, j in np.argwhere(core):
+        core[i, j] = not joins_nothing(core)[0][i, j]
+    return core
+
+
+@given(seed=st.integers(0, 10_000))
+def test_thinning_asks_only_where_something_changed_and_takes_off_the_same(seed):
+    core = blobs(seed)
+    expected = thinned_as_written(core)
+    cells = strands.thinned(core)
+    assert np.array_equal(cells, np.argwhere(expected))
+    assert np.array_equal(core, expected)
+
+
 def fork(angle_deg):
     """Maps of a trunk that parts into a straight limb and one that leaves at an angle."""
     turn = np.radians(angle_deg)
