@@ -35,7 +35,7 @@ def axes(cells: I64, ends: I64, maps: F32, stride: int, out: F64) -> None:
         for cell in cells[begin:end]:
             u += cell % width
             v += cell // width
-            log_radius += maps[4, cell // width, cell % width]
+            log_radius += float(maps[4, cell // width, cell % width])
         u, v, log_radius = u / count, v / count, log_radius / count
         uu, uv, vv = 0.0, 0.0, 0.0
         for cell in cells[begin:end]:

@@ -19,6 +19,7 @@ SMALL = (
     "test_spline.py::test_radius_is_the_papers_half_extent_along_pc2",
     "segmenters/test_labels.py::test_targets_say_where_branches_are_how_they_run_and_how_thick",
     "segmenters/test_grouping.py::test_branches_that_touch_side_by_side_are_two",
+    "segmenters/test_scorer.py::test_a_strip_is_looked_up_between_cells",
     "segmenters/test_scorer.py::test_a_mirrored_strip_is_the_strip_of_a_mirrored_picture",
     "segmenters/test_grouping.py::test_at_a_fork_the_straightest_way_goes_on",
 )

@@ -230,8 +230,9 @@ def test_training_from_nothing_gives_weights_that_segment_and_are_gone_on_from(
     )
     assert code == 0
     before, after = (load(folder / "unet.pt").network.state_dict() for folder in (first, second))
-    assert before.keys() == after.keys()
-    assert any(not torch.equal(before[name], value) for name, value in after.items())
+    learned = [name for name, value in before.items() if value.ndim > 1]
+    apart = torch.stack([(after[name] - before[name]).abs().max() for name in learned])
+    assert ((apart > 0) & (apart < 1e-3)).all()  # one gentle step from there
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,8 @@ class Scorer(nn.Module):
         views = [
             self.standardised(view) for view in (strips, mirrored(strips, along=True, across=True))
         ]
+        if torch.is_autocast_enabled("cpu"):  # once, not in each judge
+            views = [view.to(torch.get_autocast_dtype("cpu")) for view in views]
         said = [judge(view) for judge in self.judges for view in views]
         return self.seen * (self.slope * torch.stack(said).mean(dim=0) + self.shift)
 

@@ -150,7 +150,7 @@ def masks_of(
     masks: list[BranchMask] = []
     cell_px = np.array(size) / strands.label.shape
     for number, box in enumerate(find_objects(strands.label), start=1):
-        if box is None or scores[number - 1] < least_score:
+        if box is None or not scores[number - 1] >= least_score:
             continue
         pixels = [
             np.arange(floor(span.start * cell), min(ceil(span.stop * cell), most))

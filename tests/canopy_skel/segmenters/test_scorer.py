@@ -3,7 +3,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes.bars import KNOWN, MAP, SIZE, bar, candidates
+from scenes.bars import KNOWN, MAP, MIDDLE, RADIUS_CELLS, SIZE, bar, candidates
 
 from canopy_skel.segmenters.unet.network import Known, Maps
 from canopy_skel.segmenters.unet.precision import has_fast_bfloat16
@@ -41,6 +41,24 @@ def test_a_strip_shows_a_strand_along_its_axis_whichever_way_it_runs(angle, leng
     assert sign * ways == pytest.approx(-reach[sure], abs=0.12)
     assert strip[MAP["middle_v"]] == pytest.approx(0, abs=0.1)
     assert strip[len(Maps._fields) : KNOWN] == pytest.approx(7, abs=1e-4)
+
+
+def test_a_strip_is_looked_up_between_cells():
+    known, cells = bar(33, 61)
+    known.features[1], known.features[0] = np.mgrid[: SIZE[0], : SIZE[1]]
+    (strip,) = strips_of(known, candidates(cells))
+    u, v = strip[len(Maps._fields) : KNOWN]
+    c, s = np.cos(np.radians(33)), np.sin(np.radians(33))
+    along, across = (
+        (u - MIDDLE[0]) * c + (v - MIDDLE[1]) * s,
+        (v - MIDDLE[1]) * c - (u - MIDDLE[0]) * s,
+    )
+    reach = np.linspace(-1.5, 1.5, ALONG)[:, None] * 61 / 2
+    assert along == pytest.approx(np.broadcast_to(reach, along.shape), abs=1.5)
+    assert np.diff(along, axis=0) == pytest.approx(np.ptp(along[:, 4]) / (ALONG - 1), abs=0.03)
+    aside = np.linspace(-1, 1, ACROSS) * 3 * RADIUS_CELLS
+    assert across == pytest.approx(np.broadcast_to(aside, across.shape), abs=0.5)
+    assert np.diff(across, axis=1) == pytest.approx(3 * RADIUS_CELLS / 4, abs=0.03)
 
 
 def test_what_lies_outside_the_picture_is_empty_and_said_to_be():
@@ -83,10 +101,11 @@ def test_scores_are_between_none_and_one_each_for_itself():
 def test_more_strands_than_fit_into_one_batch_are_all_scored():
     scorer = random_scorer()
     known, cells = bar(0, 60)
-    shorter = [cells[: 60 + 20 * (k % 5)] for k in range(600)]
-    scores = scorer.scores(known, candidates(*shorter))
-    assert scores == pytest.approx(np.tile(scores[:5], 120), abs=1e-5)
-    assert len(np.unique(scores[:5])) == 5
+    across = np.arange(SIZE[0] * SIZE[1]).reshape(SIZE)[30:90, 78:82].ravel()
+    kinds = [cells, cells[: len(cells) // 2], np.arange(40), across, across[:120]]
+    scores = scorer.scores(known, candidates(*(kinds[k % 5] for k in range(600))))
+    assert scores == pytest.approx(np.tile(scores[:5], 120), abs=1e-6)
+    assert np.diff(np.sort(scores[:5])).min() > 1e-5
 
 
 def test_one_that_never_saw_a_strand_says_one_half():
