@@ -224,7 +224,7 @@ def thinned_as_written(core):
 
 
 @given(seed=st.integers(0, 10_000))
-def test_thinning_asks_only_where_something_changed_and_takes_off_the_same(seed):
+def test_thinning_takes_off_what_guo_and_hall_do(seed):
     core = blobs(seed)
     expected = thinned_as_written(core)
     cells = strands.thinned(core)
