@@ -211,13 +211,16 @@ def links(number: I32, cells: I32, maps: F32, gate: F64, tries: int) -> I32:
                     n = number[a, b]
                     if n < 0 or n == k or n == link[k, 0] or n == link[k, 1]:
                         continue
-                    price = _price(cells, courses, k, n, window, gate)
-                    side = 1 if price > 0 else 0
-                    if abs(price) >= cost[side] or link[k, side] >= 0:
+                    ahead = courses[k, 0] * (b - j) + courses[k, 1] * (a - i)
+                    side = 1 if ahead > 0 else 0
+                    if link[k, side] >= 0:
+                        continue
+                    price = abs(_price(cells, courses, k, n, window, gate))
+                    if price >= cost[side]:
                         continue
                     back = 1 if _price(cells, courses, n, k, 99.0, gate) > 0 else 0
                     if link[n, back] < 0:
-                        cost[side], best[k, side] = abs(price), n
+                        cost[side], best[k, side] = price, n
         for k in range(len(cells)):
             for side in range(2):
                 n = best[k, side]

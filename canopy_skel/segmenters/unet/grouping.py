@@ -144,7 +144,7 @@ def _strands(
     together = np.concatenate([np.empty((0, 2), np.int32), *paths])
     count = strands.painted(together, np.stack([ends[:-1], ends[1:]], axis=1), field[2], label)
     strands.grown(label, inside, field[2], grouping.reach)
-    place = np.flatnonzero(label)
+    place = np.flatnonzero(label > 0)  # of truths NumPy counts faster
     own = label.ravel()[place] - 1
     ends = np.cumsum([0, *np.bincount(own, minlength=count)])
     place = place[np.argsort(own, kind="stable")]
