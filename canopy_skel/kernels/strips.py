@@ -8,7 +8,7 @@ from math import atan2, cos, floor, log, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from canopy_skel.kernels.compiled import kernel
+from canopy_skel.kernels.compiled import inner, kernel
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -55,6 +55,38 @@ def axes(cells: I64, ends: I64, maps: F32, stride: int, out: F64) -> None:
         out[i, 4], out[i, 5], out[i, 6] = 0.5 * length, log_radius, log(stride * length)
 
 
+@inner("void(float32[:,:,::1], float32[:,:,:], float64, float64, float32[::1])")
+def _read_between(maps: F32, features: F32, u: float, v: float, sample: F32) -> None:
+    """Add maps and features at a place between cells to a sample, all 0; nothing outside."""
+    height, width = maps.shape[1:]
+    column, row = floor(u), floor(v)
+    for y in range(row, row + 2):
+        for x in range(column, column + 2):
+            if 0 <= y < height and 0 <= x < width:
+                share = np.float32((1 - abs(u - x)) * (1 - abs(v - y)))
+                for k in range(MAPS):
+                    sample[k] += share * maps[k, y, x]
+                for k in range(len(features)):
+                    sample[MAPS + k] += share * features[k, y, x]
+
+
+@inner("void(float64[::1], float64, float32[::1])")
+def _seen_from(axis: F64, most_logit: float, sample: F32) -> None:
+    """Turn directions and ways of a sample to an axis; radius and length are those beside its own.
+
+    Logits are at most `most_logit`.
+    """
+    c, s = axis[2], axis[3]
+    twice_c, twice_s = c * c - s * s, 2 * c * s
+    cosine, sine, ahead, beside = sample[2], sample[3], sample[5], sample[6]
+    sample[2], sample[3] = cosine * twice_c + sine * twice_s, sine * twice_c - cosine * twice_s
+    sample[5], sample[6] = ahead * c + beside * s, beside * c - ahead * s
+    sample[4] -= axis[5]
+    sample[7] -= axis[6]
+    for k in range(2):
+        sample[k] = min(max(sample[k], -most_logit), most_logit)
+
+
 @kernel(
     "void(float32[:,:,::1], float32[:,:,:], float64[:,::1], float64[::1], int64[::1], int64[::1],"
     " float64, float64, boolean[::1], float32[:,:,:,::1])"
@@ -71,12 +103,11 @@ def looked_along(
     own: Bool,
     out: F32,
 ) -> None:
-    """Fill out (N, ALONG, ACROSS, MAPS + K + 2) with strips of maps (MAPS, h, w) and features.
+    """Fill out (N, ALONG, ACROSS, MAPS + K + 2), all 0, with strips of maps and features.
 
-    features: (K, h, w). A strip is as long as `beyond` times the strand and `side` (N,) wide to
-    either side. Of each place: the maps and the features, between cells, nothing outside; whether
-    it is of the strand; whether it is in the picture. Directions and ways are turned to the axis,
-    radius and length are those beside the strand's own, logits at most `most_logit`.
+    maps: (MAPS, h, w). features: (K, h, w). A strip is as long as `beyond` times the strand and
+    `side` (N,) wide to either side. Of each place: the maps and the features there, as
+    `_seen_from` the axis; whether it is of the strand; whether it is in the picture.
     own: (h w,), all False.
     """
     height, width = maps.shape[1:]
@@ -84,7 +115,6 @@ def looked_along(
     far, aside = out.shape[1], out.shape[2]
     for i in range(len(out)):
         c, s = axis[i, 2], axis[i, 3]
-        twice_c, twice_s = c * c - s * s, 2 * c * s
         for cell in cells[ends[i] : ends[i + 1]]:
             own[cell] = True
         for a in range(far):
@@ -93,28 +123,11 @@ def looked_along(
                 across = (2 * b / (aside - 1) - 1) * side[i]
                 u = axis[i, 0] + along * c - across * s
                 v = axis[i, 1] + along * s + across * c
-                strip = out[i, a, b]
-                strip[:] = 0
-                column, row = floor(u), floor(v)
-                for y in range(row, row + 2):
-                    for x in range(column, column + 2):
-                        if 0 <= y < height and 0 <= x < width:
-                            share = np.float32((1 - abs(u - x)) * (1 - abs(v - y)))
-                            for k in range(MAPS):
-                                strip[k] += share * maps[k, y, x]
-                            for k in range(known - MAPS):
-                                strip[MAPS + k] += share * features[k, y, x]
-                for k in range(2):
-                    strip[k] = min(max(strip[k], -most_logit), most_logit)
-                cosine, sine, ahead, beside = strip[2], strip[3], strip[5], strip[6]
-                strip[2] = cosine * twice_c + sine * twice_s
-                strip[3] = sine * twice_c - cosine * twice_s
-                strip[5], strip[6] = ahead * c + beside * s, beside * c - ahead * s
-                strip[4] -= axis[i, 5]
-                strip[7] -= axis[i, 6]
+                _read_between(maps, features, u, v, out[i, a, b])
+                _seen_from(axis[i], most_logit, out[i, a, b])
                 x, y = round(u), round(v)
                 if 0 <= y < height and 0 <= x < width:
-                    strip[known] = own[y * width + x]
-                    strip[known + 1] = 1
+                    out[i, a, b, known] = own[y * width + x]
+                    out[i, a, b, known + 1] = 1
         for cell in cells[ends[i] : ends[i + 1]]:
             own[cell] = False

@@ -72,7 +72,7 @@ def _convolution(inner: int, outer: int, size: int = 3, stride: int = 1) -> nn.S
 
 def _enlarged_and_added(x: Tensor, skip: Tensor) -> Tensor:
     """Return a skip (N, C, H, W) and, on each two by two of its cells, one of x."""
-    if torch.onnx.is_in_onnx_export():
+    if torch.onnx.is_in_onnx_export():  # one step that every runtime knows
         return functional.interpolate(x, scale_factor=2.0, mode="nearest") + skip
     count, channels, height, width = x.shape
     cells = skip.view(count, channels, height, 2, width, 2)

@@ -139,7 +139,7 @@ def strips_of(known: Known, candidates: Candidates) -> Float32Array:
     strips.axes(cells, ends, known.maps, STRIDE, axes)
     side = np.maximum(_SIDE_RADII / STRIDE * np.exp(axes[:, 5]), _LEAST_SIDE_CELLS)
     channels = len(known.maps) + len(known.features) + BESIDE
-    out = np.empty((count, ALONG, ACROSS, channels), dtype=np.float32)
+    out = np.zeros((count, ALONG, ACROSS, channels), dtype=np.float32)
     own = np.zeros(height * width, dtype=np.bool_)
     strips.looked_along(
         known.maps, known.features, axes, side, cells, ends, _BEYOND, _MOST_LOGIT, own, out

@@ -413,5 +413,5 @@ def test_a_strip_covers_its_area_around_its_middle(v, u, angle, length, radius):
     rows, columns = np.nonzero(region.mask)
     middle = np.array([columns.mean() + region.left, rows.mean() + region.top]) + 0.5
     assert abs((middle - [u, v]) @ across) < 0.6 * radius
-    # Of a row that the strip's edge runs along, one end may be covered and the other not.
+    # Of a row or diagonal that the edge runs along, one end may be covered and the other not.
     assert abs((middle - [u, v]) @ along) < 1.5 + length / (8 * radius)
