@@ -50,7 +50,7 @@ def test_onnxruntime_gives_the_maps_of_torch(onnxruntime, model, tmp_path):
             expected = model.network(normalised(pictures)).numpy()
         given = pictures.transpose(0, 3, 1, 2).astype(np.float32)
         (maps,) = session.run([OUTPUT], {INPUT: given})
-        assert maps.shape == (count, 5, height // 2, width // 2)
+        assert maps.shape == (count, 8, height // 2, width // 2)
         np.testing.assert_allclose(maps, expected, atol=2e-4)
 
 
