@@ -27,8 +27,8 @@ class LinkConfig:
 
     reach_m: float = 0.25
     max_empty: float = 0.3
-    min_probability: float = 0.3
-    min_fragment_probability: float = 0.5
+    min_probability: float = 0.4
+    min_fragment_probability: float = 0.6
     candidates: int = 6
     spacing_m: float = 0.008
 
