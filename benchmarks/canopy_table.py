@@ -80,16 +80,18 @@ LIMITS = (  # run, figure, at most
     *((run, "view_ms", (None, 300, None)) for run in (M, F)),
 )
 BINS = 10
+TIMES = 4
 INTRODUCTION = """# Method canopy beside method paper
 
 Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted and working points
 set on other trees (the models' file names them; no walnut is among them). Columns are explained
 in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it
-(there was one after the view before, as in a live scan), without segmentation and the network's
-maps; other work on the machine adds to it. The number behind a recording is the share of its truth
-that no mask covers, which decides its class: up to .375 light, over .625 heavy. Masks are the
-simulated ones; fragments are told by colour, by the built-in network and by what lies around each
-pixel, and simulated pictures are not an orchard's: the rows "masks only" do not depend on them.
+(there was one after the view before, as in a live scan), the best of four times, without
+segmentation and the network's maps; other work on the machine adds to it. The number behind a
+recording is the share of its truth that no mask covers, which decides its class: up to .375 light,
+over .625 heavy. Masks are the simulated ones; fragments are told by colour, by the built-in network
+and by what lies around each pixel, and simulated pictures are not an orchard's: the rows "masks
+only" do not depend on them.
 (Network and models learned from pictures of the renderer of those numbered 005 and 006, of other
 trees; the four without a number were made by another.)
 Rows with *worse masks* (a quarter dropped, a fifth false) and with the masks of the built-in
@@ -148,13 +150,16 @@ def figures_of(path, cache, names):
 def run(views, truth, segmenter, config):
     inner = segmenter_named(segmenter)
     maker = Skeletonizer(Once(inner, views), config, models=models_for(inner))
-    for view in views[:-1]:
+    for view in views:
         maker.add_view(view)
-    maker.skeleton()  # a live scan makes one after every view, and goes on from it
-    started = time.process_time()
-    maker.add_view(views[-1])
-    graph = maker.skeleton().graph
-    view_ms = 1000 * (time.process_time() - started)
+    view_ms = []
+    for _ in range(TIMES):
+        maker.remove_view(views[-1].index)
+        maker.skeleton()  # a live scan makes one after every view, and goes on from it
+        started = time.process_time()
+        maker.add_view(views[-1])
+        graph = maker.skeleton().graph
+        view_ms.append(1000 * (time.process_time() - started))
     document = build_document(
         graph,
         scan_id="table",
@@ -163,7 +168,7 @@ def run(views, truth, segmenter, config):
         views_used=len(views),
     )
     return score(document, truth).to_dict() | {
-        "view_ms": view_ms,
+        "view_ms": min(view_ms),
         "reliability": reliability(document, truth),
     }
 
