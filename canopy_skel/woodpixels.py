@@ -35,6 +35,11 @@ class PixelModel:
     second_bias: float
     provenance: str
 
+    @property
+    def fitted_to(self) -> frozenset[str]:
+        """The names of the scans that its provenance ends with."""
+        return frozenset(self.provenance.rpartition(": ")[2].split(", "))
+
     def probability(
         self,
         layers: Float32Array,

@@ -8,14 +8,14 @@ from scipy.spatial import cKDTree
 from canopy_skel.canopy import CanopyConfig, CanopyScan
 from canopy_skel.confidence import Depth, Models, ModelSets
 from canopy_skel.document import from_json
-from canopy_skel.errors import RecordingError
+from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.fitting import Lesson, fit_models, truth_points
 from canopy_skel.frame import View
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.mapping import WithMaps
-from canopy_skel.woodpixels import PixelModel
+from canopy_skel.woodpixels import PixelModel, shipped_pixel_model
 from drivers.stereo import with_depth
 from service.experiment.segmenters import segmenter_named
 from service.pixellessons import pixel_model_of
@@ -26,27 +26,35 @@ def pixel_models_without(
 ) -> dict[Path, PixelModel | None]:
     """Return for each recording a model of wood pixels that was fitted to other trees.
 
-    Those of the recordings, and of `more`.
-
     A model knows the trees it was fitted to better than others, and confidences learned there would
-    promise too much. Trees, by name without the foliage, are dealt out in two halves; where one is
-    empty there is nothing to fit to: None, the shipped model.
+    promise too much. Of a tree that the shipped model was not fitted to: None, the shipped model.
+    The other trees, those of `more` with them, are dealt out in two halves, each with a model
+    fitted to the other half; a tree is known by the name of its recordings without the foliage.
 
     Raises:
         RecordingError: one cannot be read, or has no truth.
+        UsageError: all that the shipped model was fitted to is one tree.
     """
-    every = sorted({*paths, *more})
-    trees = sorted({_tree(path) for path in every})
-    halves = [[path for path in every if trees.index(_tree(path)) % 2 == k] for k in (0, 1)]
-    if not all(halves):
-        return dict.fromkeys(paths)
+    known = {_tree(name) for name in shipped_pixel_model().fitted_to}
+    seen = [path for path in paths if _tree(path.stem) in known]
+    result: dict[Path, PixelModel | None] = dict.fromkeys(paths)
+    if not seen:
+        return result
+    every = sorted({*seen, *more})
+    trees = sorted({_tree(path.stem) for path in every})
+    if len(trees) < 2:
+        raise UsageError(
+            f"the shipped model of wood pixels was fitted to {trees[0]}, the only tree of its own"
+            " here; give another of those with --pixels"
+        )
+    halves = [[path for path in every if trees.index(_tree(path.stem)) % 2 == k] for k in (0, 1)]
     models = [pixel_model_of(half, ("recorded",)) for half in halves]
-    return {path: models[1 - trees.index(_tree(path)) % 2] for path in paths}
+    return result | {path: models[1 - trees.index(_tree(path.stem)) % 2] for path in seen}
 
 
-def _tree(path: Path) -> str:
+def _tree(name: str) -> str:
     """Return species and topology, which names of simulated scans begin with."""
-    return "_".join(path.stem.split("_")[:2])
+    return "_".join(name.split("_")[:2])
 
 
 def lesson_from(

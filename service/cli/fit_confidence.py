@@ -28,7 +28,10 @@ def fit_confidence(
     ] = None,
     pixels: Annotated[
         list[Path] | None,
-        typer.Option(help="More recordings to learn wood pixels from meanwhile; repeatable."),
+        typer.Option(
+            help="More recordings of trees that fit-wood was given, to learn wood pixels from"
+            " meanwhile; repeatable."
+        ),
     ] = None,
     segmenter: Annotated[
         list[str] | None,
@@ -41,8 +44,8 @@ def fit_confidence(
     """Refit the confidences of method canopy to scans whose truth is known.
 
     Those for recorded masks are fitted to recorded masks, with and without fragments; those for
-    learned masks to these and the ones of all other segmenters. What tells wood pixels is fitted
-    for each half of the trees to the other half meanwhile; see fit-wood for the shipped one.
+    learned masks to these and the ones of all other segmenters. Of trees that the shipped model of
+    wood pixels was fitted to (fit-wood), each half gets one that is fitted to the other half.
     """
     # Imported here: only this command fits.
     from canopy_skel.confidence import models_to

@@ -14,10 +14,11 @@ from scenes.wood import WOOD, view_from
 
 from canopy_skel.confidence import models_from
 from canopy_skel.document import Method, build_document, from_json, to_json
+from canopy_skel.errors import UsageError
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter
-from canopy_skel.woodpixels import pixel_model_from, pixel_model_to
+from canopy_skel.woodpixels import pixel_model_from, pixel_model_to, shipped_pixel_model
 from service.lessons import fitted, lessons_from, pixel_models_without
 
 ROOT = Path(__file__).parents[2]
@@ -66,18 +67,23 @@ def test_confidences_are_learned_beside_wood_pixels_of_other_trees(tmp_path):
     truth = to_json(
         build_document(sticks(), scan_id="t", revision=1, method=Method(name="truth"), views_used=0)
     )
-    paths = [tmp_path / f"{name}.mcap" for name in ("apple_1_fd1", "apple_1_fd2", "oak_1_fd1")]
-    for path in paths:
+    names = ("apple_100_fd1", "apple_100_fd2", "oak_100_fd1", "pear_1_fd1")
+    *seen, unseen = [tmp_path / f"{name}.mcap" for name in names]
+    for path in (*seen, unseen):
         write(path, [leafy_view(0), leafy_view(1, y=0.1)], truth)
-    beside = pixel_models_without(paths)
-    assert [beside[path].provenance.split("): ")[1] for path in paths] == [
-        "oak_1_fd1",
-        "oak_1_fd1",
-        "apple_1_fd1, apple_1_fd2",
+    assert {"apple_100_fd1", "oak_100_fd1"} < shipped_pixel_model().fitted_to
+    beside = pixel_models_without([*seen, unseen])
+    assert [beside[path].fitted_to for path in seen] == [
+        {"oak_100_fd1"},
+        {"oak_100_fd1"},
+        {"apple_100_fd1", "apple_100_fd2"},
     ]
-    assert pixel_models_without(paths[:2]) == dict.fromkeys(paths[:2])
-    more = pixel_models_without(paths[2:], paths[:2])
-    assert [model.provenance for model in more.values()] == [beside[paths[2]].provenance]
+    assert beside[unseen] is None
+    assert pixel_models_without([unseen]) == {unseen: None}
+    more = pixel_models_without(seen[2:], seen[:2])
+    assert [model.fitted_to for model in more.values()] == [{"apple_100_fd1", "apple_100_fd2"}]
+    with pytest.raises(UsageError, match="apple_100, the only tree"):
+        pixel_models_without(seen[:2])
 
 
 def test_each_kind_of_depth_has_confidences_from_its_own_scans(tmp_path):
