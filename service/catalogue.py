@@ -27,6 +27,8 @@ from service.rig import FINISHED, ScanState, ScanStatus
 from service.tables import EVENTS, IDEMPOTENCY, REVISIONS, SCANS
 
 KEY_LIFETIME_NS = 24 * 3600 * 10**9
+MOST_NUMBER = 2**63 - 1
+"""The largest number it can be asked for."""
 INTERRUPTED = (
     "the service ended during this scan; look at the arm, acknowledge, then resume or cancel"
 )

@@ -136,6 +136,7 @@ class LocalRig:
     def start(self, spec: ScanSpec) -> ScanStatus:
         """Begin a scan; see `Rig.start`."""
         with self._lock:
+            stops = self._stops
             self._require_free()
             self._require_ready()
             verdicts = self.plan(spec)
@@ -146,7 +147,7 @@ class LocalRig:
                     f" waypoint {bad[0].index}: {bad[0].reason}",
                     verdicts,
                 )
-            return self._launch(spec)
+            return self._launch(spec, stops)
 
     def pause(self, scan_id: str) -> ScanStatus:
         """Stop the arm and keep the scan."""
@@ -157,12 +158,13 @@ class LocalRig:
     def resume(self, scan_id: str) -> ScanStatus:
         """Go on at the first missing waypoint."""
         with self._lock:
+            stops = self._stops
             spec, session = self._session(scan_id)
             if session.status.state in FINISHED:
                 raise RigNotReadyError(f"scan {scan_id} is {session.status.state}; start a new one")
             self._require_free()
             self._require_ready()
-            return self._launch(spec)
+            return self._launch(spec, stops)
 
     def cancel(self, scan_id: str) -> ScanStatus:
         """Stop the arm and end the scan; what was recorded stays."""
@@ -175,7 +177,7 @@ class LocalRig:
         """Stop the arm now, whatever is under way; an acknowledgement is needed afterwards."""
         self._stopped = "the arm was stopped by the operator"
         self._stops += 1
-        running = [s for _, s in self._sessions.values() if s.status.state is ScanState.RUNNING]
+        running = [session for _, session in [*self._sessions.values()] if session.running]
         try:
             if not running:
                 self._parts.arm.stop()
@@ -244,12 +246,27 @@ class LocalRig:
         """Tell the listeners of something that happened elsewhere, such as a new skeleton."""
         self._tell(scan_id, kind, fields)
 
-    def _launch(self, spec: ScanSpec) -> ScanStatus:
+    def _launch(self, spec: ScanSpec, stops: int) -> ScanStatus:
+        """Start a session, unless the arm was stopped since `stops` was read.
+
+        The session is there to be stopped before that is looked at: no stop falls in between.
+        """
         session = self._session_for(spec)
-        self._sessions[spec.scan_id] = (spec, session)
         session.path.parent.mkdir(parents=True, exist_ok=True)
-        self._parts.feed.begin(spec, session.path)
-        session.start()
+        before = self._sessions.get(spec.scan_id)
+        self._sessions[spec.scan_id] = (spec, session)
+        try:
+            if self._stops != stops:
+                self._require_ready()
+                raise RigNotReadyError("arm: it was stopped meanwhile; look at it, then try again")
+            self._parts.feed.begin(spec, session.path)
+            session.start()
+        except Exception:
+            if before is None:
+                del self._sessions[spec.scan_id]
+            else:
+                self._sessions[spec.scan_id] = before
+            raise
         return session.status
 
     def _session_for(self, spec: ScanSpec) -> ScanSession:

@@ -106,6 +106,11 @@ class ScanSession:
         return not self._thread.is_alive()
 
     @property
+    def running(self) -> bool:
+        """Whether it has not ended; known at once, also while a move is being begun."""
+        return self._state is ScanState.RUNNING
+
+    @property
     def status(self) -> ScanStatus:
         """The scan as it is now."""
         with self._lock:

@@ -60,6 +60,9 @@ class Scans:
             logger.warning("scan was under way when the service ended scan_id=%s", scan_id)
             self._rig.hold(f"the service ended during scan {scan_id}")
             self._add_event(self.record(scan_id).status, "interrupted", {})
+        for left in self.catalogue.unfinished():  # whoever acknowledged told a rig that is gone
+            scan_id = left.status.scan_id
+            self._rig.hold(f"scan {scan_id} was stopped before the service was started again")
         self._rig.subscribe(self._events.put)
         self._journal.start()
         return self

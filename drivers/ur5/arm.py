@@ -243,7 +243,7 @@ class Ur5Arm:
     # What the child says, in the link's thread
 
     def _on_sample(self, sample: Sample) -> None:
-        cause = self._cause(sample)
+        cause = self._cause(sample) or self._ended_at_rest(sample)
         if cause is not None and self._latch is None:
             self._latch = cause
         stamp_ns = self._clock.host_ns(sample.stamp_s, sample.arrived_ns)
@@ -261,6 +261,17 @@ class Ur5Arm:
         if sample.move == self._move and sample.status is MoveStatus.INTERRUPTED:
             return MoveInterruptedError(sample.detail)
         return None
+
+    def _ended_at_rest(self, sample: Sample) -> ArmError | None:
+        """Return that our script has ended, or was paused, while no move was under way.
+
+        Somebody did that who may be on the way to the tree: the next move must not undo it.
+        """
+        before = self._newest
+        ran = before is not None and before[0].tcp_is_flange
+        if not ran or sample.tcp_is_flange or self._under_way(sample):
+            return None
+        return MoveInterruptedError("the program on the controller was ended or paused")
 
     def _on_down(self, error: ArmLinkError) -> None:
         log.warning("%s: %s", self._config.host, error)

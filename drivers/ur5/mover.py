@@ -19,6 +19,7 @@ from drivers.ur5.watch import MoveRecord, Watch
 if TYPE_CHECKING:
     from rtde_control import RTDEControlInterface
 
+_MAY_MOVE = (SafetyMode.NORMAL, SafetyMode.REDUCED)
 _POLL_S = 0.005
 _BRAKE_S = 2.0
 _CAUSE_S = 0.02
@@ -59,9 +60,14 @@ class Mover:
             self._follow()
 
     def stop(self) -> None:
-        """Brake and forget the move under way."""
-        if self._record.moving:
+        """Brake and forget the move under way, on the controller too: `play` must not resume it."""
+        under_way = self._record.moving
+        if under_way:
             self._record.end(MoveStatus.STOPPED, "stopped on request")
+        safe = self._watch.newest.safety_mode in _MAY_MOVE
+        if under_way and not (safe and self._runs()):
+            self._dashboard.ask("stop")
+            return
         if not self._runs():
             return
         if not self._braking:
@@ -155,7 +161,7 @@ class Mover:
 
     def _follow(self) -> None:
         newest = self._watch.newest
-        if newest.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+        if newest.safety_mode not in _MAY_MOVE:
             self._interrupt("safety stop")
         elif not self._runs():
             self._not_running_since_s = min(self._not_running_since_s, newest.stamp_s)

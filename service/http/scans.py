@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.bell import wait_for_ring
-from service.catalogue import EventRecord, ScanRecord
+from service.catalogue import MOST_NUMBER, EventRecord, ScanRecord
 from service.http.context import Context, Here, KnownScan, refuse_foreign_pages
 from service.http.problems import Problem
 from service.http.requests import ScanBody, scan_spec
@@ -101,7 +101,7 @@ def cancel_scan(scan_id: str, here: Here) -> dict[str, Any]:
 async def follow_scan(
     scan_id: KnownScan,
     here: Here,
-    last_event_id: Annotated[int, Header(ge=0)] = 0,
+    last_event_id: Annotated[int, Header(ge=0, le=MOST_NUMBER)] = 0,
 ) -> AsyncIterator[ServerSentEvent]:
     """Stream what happened and happens, after event `Last-Event-ID`; ends with the scan (`end`)."""
     seq, silent = last_event_id, False

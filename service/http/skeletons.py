@@ -6,14 +6,14 @@ from time import perf_counter
 from types import MappingProxyType
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Response
+from fastapi import APIRouter, Header, Path, Response
 from fastapi.concurrency import run_in_threadpool
 
 from canopy_skel.document import from_json
 from canopy_skel.exports import FORMATS
 from canopy_skel.schema import schema_text
 from service.bell import wait_for_ring
-from service.catalogue import RevisionRecord
+from service.catalogue import MOST_NUMBER, RevisionRecord
 from service.http.context import Context, Here, KnownScan
 from service.http.negotiation import best_media_type, matches, wait_s
 from service.http.problems import Problem
@@ -33,6 +33,7 @@ MEDIA_TYPES = MappingProxyType(
 Accept = Annotated[str, Header()]
 IfNoneMatch = Annotated[str, Header()]
 Prefer = Annotated[str, Header()]
+Revision = Annotated[int, Path(le=MOST_NUMBER)]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -82,7 +83,11 @@ async def newest_skeleton_as(
 
 @router.get("/v1/scans/{scan_id}/skeleton/revisions/{revision}.{suffix}", response_class=Response)
 def skeleton_revision_as(
-    scan_id: KnownScan, revision: int, suffix: str, here: Here, if_none_match: IfNoneMatch = ""
+    scan_id: KnownScan,
+    revision: Revision,
+    suffix: str,
+    here: Here,
+    if_none_match: IfNoneMatch = "",
 ) -> Response:
     """Return one revision as json, glb, swc, ply, csv or graphml."""
     return _one(here, scan_id, revision, _known_format(suffix), if_none_match)
@@ -91,7 +96,7 @@ def skeleton_revision_as(
 @router.get("/v1/scans/{scan_id}/skeleton/revisions/{revision}", response_class=Response)
 def skeleton_revision(
     scan_id: KnownScan,
-    revision: int,
+    revision: Revision,
     here: Here,
     accept: Accept = "*/*",
     if_none_match: IfNoneMatch = "",

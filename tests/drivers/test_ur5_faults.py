@@ -195,6 +195,41 @@ def test_somebody_ends_or_pauses_the_program_at_the_pendant(fake, moving, line):
     assert_held_until_acknowledged(fake, arm, target)
 
 
+@pytest.mark.parametrize("line", ["stop", "pause", "power off"])
+def test_what_somebody_ends_at_the_pendant_while_the_arm_stands_is_not_begun_anew(fake, arm, line):
+    target = down(arm.state(), WAY_M)
+    arm.start_move(linear(down(arm.state(), 0.01)))
+    wait_settled(arm, timeout_s=10.0)
+    Dashboard(fake.host).ask(line)
+    time.sleep(0.1)
+    if line == "power off":
+        for mend in ("power on", "brake release"):
+            Dashboard(fake.host).ask(mend)
+    time.sleep(0.1)
+    with pytest.raises(ArmError):
+        arm.start_move(linear(target))
+    assert_stands_still(arm)
+    arm.acknowledge("looked at the tree, nobody near")
+    arm.start_move(linear(target))
+    end = wait_settled(arm, timeout_s=10.0)
+    assert end.pose.base_from_tool0 == pytest.approx(target, abs=1e-6)
+
+
+def test_a_move_stopped_after_a_safety_stop_is_dropped_on_the_controller(
+    fake, moving_without_watchdog
+):
+    arm, _ = moving_without_watchdog
+    time.sleep(0.1)
+    fake.do("protective_stop")
+    with pytest.raises(ProtectiveStopError):
+        wait_settled(arm, timeout_s=2.0)
+    arm.stop()
+    time.sleep(UNLOCK_S)
+    fake.do("unlock")
+    assert Dashboard(fake.host).ask("play") == "Failed to execute: play"
+    assert_stands_still(arm)
+
+
 def test_link_drop(fake, moving):
     arm, target = moving
     fake.do("cut_link")

@@ -146,7 +146,8 @@ class Rig:
 
     def tidy_up(self):
         """Leave the rig ready and without a scan, whatever a test did to it."""
-        self.controller.do("reset")
+        self.controller.do("reset")  # the driver is to see that its program is gone
+        time.sleep(0.3)
         for scan in self.http.get("/v1/scans").json()["scans"]:
             if scan["state"] not in ("done", "cancelled", "failed"):
                 self.http.post(f"/v1/scans/{scan['scan_id']}:cancel")

@@ -113,6 +113,20 @@ def test_a_killed_service_leaves_the_arm_at_rest_and_its_scan_can_be_resumed(ser
 
 
 @pytest.mark.timeout(200)
+def test_a_stop_outlives_the_service(service):
+    rig = service.launch()
+    wait_until_ready(rig.http)
+    scan_id = rig.start()
+    rig.wait_until_moving(scan_id, views=1)
+    assert rig.http.post("/v1/rig:stop").status_code == 200
+    rig.wait(scan_id, "stopped")
+    service.kill()
+    rig = service.launch()
+    rig.assert_held(scan_id, f"scan {scan_id} was stopped before the service was started again")
+    rig.assert_one_acknowledgement_lets_it_go_on(scan_id)
+
+
+@pytest.mark.timeout(200)
 def test_a_full_disk_stops_the_scan_and_costs_nothing(service):
     rig = service.launch()
     wait_until_ready(rig.http)

@@ -14,6 +14,7 @@ from drivers.errors import CameraTimeoutError
 from drivers.guarded_arm import GuardedArm, Limits
 from drivers.protocols import CameraImage
 from drivers.ur5.arm import Ur5Arm
+from drivers.ur5.dashboard import Dashboard
 from drivers.ur5.messages import Ur5Config
 from mock_hw.fake_ur.process import FakeUr, free_host
 from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
@@ -231,6 +232,52 @@ def test_the_operators_stop_needs_an_acknowledgement(rig, fake):
     assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
 
 
+def test_a_stop_while_a_scan_is_planned_keeps_it_from_beginning(rig, fake, monkeypatch):
+    plan = rig.plan
+
+    def stopped_meanwhile(spec):
+        rig.stop()
+        return plan(spec)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(rig, "plan", stopped_meanwhile)
+        with pytest.raises(RigNotReadyError, match="stopped by the operator"):
+            rig.start(spec())
+    assert_stands_still(fake)
+    with pytest.raises(UnknownScanError):
+        rig.status("scan-1")
+    rig.acknowledge("looked")
+    rig.start(spec())
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+
+
+def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, monkeypatch):
+    uploading, prepare = threading.Event(), Ur5Arm._prepare
+
+    def slowly(arm, sample):
+        uploading.set()
+        time.sleep(0.5)
+        prepare(arm, sample)
+
+    monkeypatch.setattr(Ur5Arm, "_prepare", slowly)
+    before = fake.do("state")["joints_rad"]
+    rig.start(spec())
+    assert uploading.wait(5.0)
+    rig.stop()
+    assert wait_for(rig, "scan-1", ScanState.STOPPED).views_done == 0
+    assert fake.do("state")["joints_rad"] == before
+    assert_stands_still(fake)
+
+
+def test_a_scan_that_cannot_begin_leaves_the_rig_free(rig, tmp_path):
+    (tmp_path / "scans").write_bytes(b"no folder")
+    with pytest.raises(NotADirectoryError):
+        rig.start(spec())
+    (tmp_path / "scans").unlink()
+    rig.start(spec("scan-2"))
+    assert wait_for(rig, "scan-2", ScanState.DONE).views_done == 4
+
+
 def test_a_stop_during_an_acknowledgement_wants_one_of_its_own(rig, fake, monkeypatch):
     rig.stop()
     arm = rig._parts.arm
@@ -265,6 +312,7 @@ def test_a_safety_stop_in_mid_move_loses_nothing_and_moves_nothing(rig, fake, fa
     with pytest.raises(RigNotReadyError):
         rig.resume("scan-1")
     assert_stands_still(fake)
+    assert Dashboard(fake.host).ask("play") == "Failed to execute: play"
     assert len(views_of(rig, "scan-1")) == status.views_done >= 1
 
 
