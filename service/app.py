@@ -30,6 +30,8 @@ def create_app(
     catalogue: Catalogue,
     paths: Mapping[str, Sequence[ArrayLike]],
     caps: SpeedCaps | None = None,
+    *,
+    segmenter: str = "recorded",
 ) -> FastAPI:
     """Return the app; its lifespan recovers the catalogue and follows the rig's events.
 
@@ -38,6 +40,7 @@ def create_app(
         catalogue: entered by the caller, and left after the app has ended.
         paths: base_from_tool0 (4, 4) waypoints by the name that `path` in a request gives.
         caps: the fastest that may be asked for.
+        segmenter: what finds the branches of a scan whose request names none.
     """
     bell = Bell()
     scans = Scans(rig, catalogue, bell)
@@ -63,6 +66,7 @@ def create_app(
         pictures=Pictures(),
         paths=paths,
         caps=caps or SpeedCaps(),
+        segmenter=segmenter,
     )
     add_handlers(app)
     routes = (rig_routes, metric_routes, scan_routes, planner_routes, skeleton_routes)

@@ -68,7 +68,8 @@ class ServeOptions:
 class Hardware:
     """Arm and camera, the hand-eye calibration, and what a simulation knows beyond them.
 
-    stage: entered around each step of a scan, for who wants to time it.
+    stage: entered around each step of a scan, for who wants to time it. segmenter: what finds the
+    branches where a request names none; only a simulated camera brings their masks along.
     """
 
     arm: Arm
@@ -76,6 +77,7 @@ class Hardware:
     tool_from_camera: FloatArray
     attachments: Callable[[], Mapping[str, bytes]]
     stage: Stage = lambda name: nullcontext()
+    segmenter: str = "recorded"
 
 
 class BusFeed:
@@ -149,7 +151,7 @@ def composed(
         stack.enter_context(rig)
         rig.subscribe(stack.enter_context(Broadcast(session, keys, rig.pose)).event)
         catalogue = stack.enter_context(Catalogue(options.data))
-        yield create_app(rig, catalogue, PATHS)
+        yield create_app(rig, catalogue, PATHS, segmenter=hardware.segmenter)
 
 
 def guarded(host: str) -> Arm:
@@ -174,7 +176,8 @@ def simulated(options: ServeOptions) -> Iterator[Hardware]:
 
 @contextmanager
 def _real(options: ServeOptions) -> Iterator[Hardware]:
-    yield Hardware(guarded(options.robot or ""), OakCamera(), TOOL_FROM_CAMERA, dict)
+    arm = guarded(options.robot or "")
+    yield Hardware(arm, OakCamera(), TOOL_FROM_CAMERA, dict, segmenter="unet")
 
 
 def worker_command(options: ServeOptions, endpoint: str) -> list[str]:

@@ -18,7 +18,10 @@ def scan(
     tree: Annotated[str, typer.Option(help="Which tree this is.")] = "tree",
     path: Annotated[str, typer.Option(help="Named path of waypoints.")] = "orchard-10",
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = DEFAULT_METHOD,
-    segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(SEGMENTERS)}.")] = "recorded",
+    segmenter: Annotated[
+        str | None,
+        typer.Option(help=f"One of {', '.join(SEGMENTERS)}; without, what suits the camera."),
+    ] = None,
     voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
     farthest: Annotated[
         float, typer.Option(help="Wood farther from the camera (m) is another tree's.")

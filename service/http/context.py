@@ -26,6 +26,7 @@ class Context:
     pictures: Pictures
     paths: Mapping[str, Sequence[ArrayLike]]
     caps: SpeedCaps
+    segmenter: str
 
 
 async def _context(request: Request) -> Context:

@@ -86,9 +86,12 @@ class ScanBody(PlanBody):
     method: MethodName = DEFAULT_METHOD
     voxel_size_m: Annotated[float, Field(ge=0.001, le=0.05, allow_inf_nan=False)] = 0.005
     segmenter: Annotated[
-        Literal["recorded", "unet"],
-        Field(description="where branch masks come from: the recording, or the learned segmenter"),
-    ] = "recorded"
+        Literal["recorded", "unet"] | None,
+        Field(
+            description="where branch masks come from: the camera, as only a simulated one brings"
+            " them, or the learned segmenter; without, whichever the rig has"
+        ),
+    ] = None
     farthest_m: Annotated[
         float,
         Field(
@@ -145,16 +148,22 @@ def plan_spec(
 
 
 def scan_spec(
-    body: ScanBody, paths: Mapping[str, Sequence[ArrayLike]], caps: SpeedCaps
+    body: ScanBody,
+    paths: Mapping[str, Sequence[ArrayLike]],
+    caps: SpeedCaps,
+    segmenter: str = "recorded",
 ) -> ScanSpec:
-    """Return the scan a body asks for, under a new scan id. Raises as `plan_spec`."""
+    """Return the scan a body asks for, under a new scan id. Raises as `plan_spec`.
+
+    segmenter: what finds the branches if the body names nothing.
+    """
     return replace(
         plan_spec(body, paths, caps),
         tree_id=body.tree_id,
         config=method_config(
             body.method, body.voxel_size_m, farthest_m=body.farthest_m, rooted=body.rooted
         ),
-        segmenter=body.segmenter,
+        segmenter=body.segmenter or segmenter,
         retakes=body.retakes,
     )
 

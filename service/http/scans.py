@@ -45,7 +45,7 @@ def start_scan(
     body: ScanBody, key: Annotated[str, Depends(idempotency_key)], here: Here
 ) -> JSONResponse:
     """Start a scan. The same key and body give the same answer and start nothing twice."""
-    spec = scan_spec(body, here.paths, here.caps)
+    spec = scan_spec(body, here.paths, here.caps, here.segmenter)
     digest = sha256(body.model_dump_json().encode()).hexdigest()
     status = here.scans.start(spec, key, digest)
     return JSONResponse(status, 202, headers={"Location": f"/v1/scans/{status['scan_id']}"})

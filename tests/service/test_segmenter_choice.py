@@ -19,6 +19,14 @@ def test_a_scan_may_ask_for_any_segmenter_and_gets_it_after_a_restart():
         assert spec_from(spec.scan_id, fields_of(spec)).segmenter == name
 
 
+def test_a_scan_that_names_no_segmenter_gets_the_one_of_the_rig():
+    body = ScanBody(tree_id="t", path="one")
+    assert scan_spec(body, PATHS, SpeedCaps()).segmenter == "recorded"
+    assert scan_spec(body, PATHS, SpeedCaps(), "unet").segmenter == "unet"
+    own = ScanBody(tree_id="t", path="one", segmenter="recorded")
+    assert scan_spec(own, PATHS, SpeedCaps(), "unet").segmenter == "recorded"
+
+
 def test_a_scan_is_made_with_method_canopy_unless_it_says_otherwise():
     spec = scan_spec(ScanBody(tree_id="t", path="one"), PATHS, SpeedCaps())
     assert spec.config == MethodConfig(name="canopy")
@@ -52,7 +60,3 @@ def test_methods_that_cannot_root_refuse_to():
 def test_an_unknown_segmenter_is_refused_before_anything_moves():
     with pytest.raises(ValidationError, match="segmenter"):
         ScanBody(tree_id="t", path="one", segmenter="maskrcnn9")
-
-
-def test_without_a_word_masks_come_from_the_recording():
-    assert ScanBody(tree_id="t", path="one").segmenter == "recorded"
