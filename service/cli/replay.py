@@ -49,6 +49,10 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Turn recordings into skeletons, with an overlay picture and a summary for each."""
+    if method in METHODS and method != "canopy" and (rooted or not fragments):
+        raise UsageError(
+            f"--rooted and --no-fragments are for method canopy; leave them out with {method}"
+        )
     request = ReplayRequest(
         config=method_config(
             method,  # type: ignore[arg-type]  # MethodConfig names the known ones

@@ -203,6 +203,8 @@ def test_methods_differ_and_say_who_they_are(canopy, recording, tmp_path):
     ("arguments", "says"),
     [
         (["--method", "best"], "unknown method 'best': choose one of canopy, paper, mst, ftsem"),
+        (["--method", "paper", "--rooted"], "for method canopy; leave them out with paper"),
+        (["--method", "mst", "--no-fragments"], "for method canopy; leave them out with mst"),
         (["--segmenter", "eyes"], "unknown segmenter 'eyes': choose one of recorded"),
         (["--formats", "json,obj"], "unknown format 'obj': choose from json"),
         (["--voxel", "0"], "voxel size 0.0 m: give a length above 0"),
