@@ -17,7 +17,7 @@ from pathlib import Path
 from canopy_skel.errors import CanopyError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
-from canopy_skel.recording import RecordingWriter, carry_over
+from canopy_skel.recording import RecordingWriter, carry_over, read_recording
 from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
 from drivers.protocols import (
@@ -166,6 +166,16 @@ class ScanSession:
         return detail
 
     def _scan(self) -> None:
+        if self.path.exists():  # whole, but the service ended before it could say so
+            views = (view for view in read_recording(self.path).views() if isinstance(view, View))
+            self._done.update(view.index for view in views)
+            for index in sorted(self._done):
+                self._recorded(index)
+        else:
+            self._record()
+        self._end(ScanState.DONE, "")
+
+    def _record(self) -> None:
         metadata = {"scan_id": self._spec.scan_id, "tree_id": self._spec.tree_id}
         metadata["config_sha256"] = self._spec.config.sha256()
         source = set_aside(self.path)
@@ -186,7 +196,6 @@ class ScanSession:
             for name, content in self._tools.attachments().items():
                 writer.attach(name, "application/json", content)
             writer.write_event(time.time_ns(), {"kind": "done", "views_done": len(self._done)})
-        self._end(ScanState.DONE, "")
 
     def _visit_all(self, writer: RecordingWriter) -> None:
         stage = self._tools.stage

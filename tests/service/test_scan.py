@@ -390,6 +390,18 @@ def test_what_a_killed_service_left_is_carried_on(rig):
     assert all(after[index] == data for index, data in before.items())
 
 
+def test_a_scan_whose_recording_is_whole_is_done_without_a_move(rig, fake):
+    """The service was killed between the end of the recording and saying so."""
+    rig.start(spec())
+    wait_for(rig, "scan-1", ScanState.DONE)
+    before = fake.do("state")["joints_rad"], rig.recording_path("scan-1").read_bytes()
+    rig.feed.offered.clear()
+    rig.start(spec())
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    assert rig.feed.offered == [0, 1, 2, 3]
+    assert (fake.do("state")["joints_rad"], rig.recording_path("scan-1").read_bytes()) == before
+
+
 def test_stop_from_another_thread_ends_motion_at_once(rig, fake):
     rig.start(spec(waypoints=WAYPOINTS))
     wait_until_moving(rig, fake)
