@@ -18,7 +18,7 @@ def serve(
     ] = False,
     robot: Annotated[str | None, typer.Option(help="Address of the UR controller.")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on.")] = 8000,
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 8000,
     data: Annotated[Path, typer.Option(help="Folder of recordings and catalogue.")] = Path("data"),
     site: Annotated[str, typer.Option(help="Name of the site on the bus.")] = "orchard",
     rig: Annotated[str, typer.Option(help="Name of the rig on the bus.")] = "rig-1",
@@ -28,7 +28,9 @@ def serve(
     species: Annotated[str, typer.Option(help="Simulated tree: apple, oak, walnut.")] = "apple",
     topology: Annotated[int, typer.Option(help="Which tree of the species.")] = 0,
     leaves: Annotated[int, typer.Option(help="How many leaves it bears.")] = 500,
-    time_scale: Annotated[float, typer.Option(help="Simulated arm: times real speed.")] = 1.0,
+    time_scale: Annotated[
+        float, typer.Option(help="Simulated arm: times real speed.", min=0.01)
+    ] = 1.0,
     picture_scale: Annotated[float, typer.Option(help="Size of simulated pictures.")] = 1.0,
 ) -> None:
     """Run the scan service: the rig over HTTP, with a worker that makes skeletons."""
