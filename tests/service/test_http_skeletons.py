@@ -109,6 +109,9 @@ def test_what_there_is_not(scan):
         assert (answer.status_code, answer.json()["code"]) == (404, code)
     answer = scan.http.get(scan.path, headers={"Accept": "image/png"})
     assert (answer.status_code, answer.json()["code"]) == (406, "not_acceptable")
+    for path in (f"/revisions/{2**63}", f"/revisions/{2**63}.json"):
+        answer = scan.http.get(f"{scan.path}{path}")
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid_request")
 
 
 def test_a_planner_waits_for_the_first_and_for_the_next_skeleton(live):
