@@ -26,7 +26,15 @@ from drivers.protocols import Stillness
 from mock_hw.fake_ur.process import FakeUr, free_host
 from mock_hw.orchard.simulate import Options, prepare
 from mock_hw.sim_camera import SimCamera
-from service.compose import Hardware, ServeOptions, composed, free_port, guarded
+from service.compose import (
+    SIMULATED_LIMITS,
+    SIMULATED_PATHS,
+    Hardware,
+    ServeOptions,
+    composed,
+    free_port,
+    simulated_arm,
+)
 from service.server import make_server
 
 PERIOD_S = 1 / 125
@@ -146,10 +154,18 @@ def serving(data, options):
         simulation = prepare(Options(species="apple", leaf_count=500, weather="fair"))
         with FakeUr(free_host(), time_scale=options.time_scale) as controller:
             watching.append(Watched(controller))
-            arm = guarded(controller.host)
+            arm = simulated_arm(controller.host)
             sim = SimCamera(lambda: arm.state().pose, simulation, scale=options.picture_scale)
             camera = StampedCamera(sim, watching[0])
-            yield Hardware(arm, camera, simulation.tool_from_camera, dict, watching[0])
+            yield Hardware(
+                arm=arm,
+                camera=camera,
+                tool_from_camera=simulation.tool_from_camera,
+                limits=SIMULATED_LIMITS,
+                paths=SIMULATED_PATHS,
+                attachments=dict,
+                stage=watching[0],
+            )
 
     serve = ServeOptions(
         data=data,

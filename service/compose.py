@@ -3,7 +3,7 @@
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,19 +27,19 @@ from service.broadcast import Broadcast
 from service.bus import Keys, open_session
 from service.catalogue import Catalogue
 from service.feeder import ScanSource, ViewFeeder
+from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
 from service.rig import PartStatus, ScanSpec
+from service.rig_file import WATCHDOG_HZ, RigFile
 from service.scan import Stage
 from service.supervisor import Supervised
 
-LIMITS = Limits(
+SIMULATED_LIMITS = Limits(
     box_min_m=(-0.9, -0.9, -0.85),
     box_max_m=(0.9, 0.9, 1.1),
     keep_outs=(KeepOut(name="tree row", normal=(-1.0, 0.0, 0.0), offset_m=-0.75),),
 )
-WATCHDOG_HZ = 2.0
-"""The controller stops by itself when the driver is silent for half a second."""
-PATHS: Mapping[str, list[FloatArray]] = {
+SIMULATED_PATHS: Mapping[str, list[FloatArray]] = {
     f"orchard-{views}": [pose @ invert(TOOL_FROM_CAMERA) for pose in camera_path(views)]
     for views in (10, 70)
 }
@@ -49,13 +49,13 @@ PATHS: Mapping[str, list[FloatArray]] = {
 class ServeOptions:
     """What `canopy serve` is told. data: folder of recordings and catalogue.
 
-    robot: host of the controller; None = simulation, of which `orchard` says what stands there,
+    robot: the real rig; None = simulation, of which `orchard` says what stands there,
     `time_scale` how much faster than real the arm moves and `picture_scale` the size of pictures.
     bus: where the bus listens, such as "tcp/127.0.0.1:7447"; None = on a free port.
     """
 
     data: Path
-    robot: str | None
+    robot: RigFile | None
     site: str
     rig: str
     orchard: Options
@@ -64,10 +64,11 @@ class ServeOptions:
     bus: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Hardware:
-    """Arm and camera, the hand-eye calibration, and what a simulation knows beyond them.
+    """Arm and camera, the hand-eye calibration, limits and paths of where they stand.
 
+    attachments: files that go with each recording: the rig file, or what a simulation knows.
     stage: entered around each step of a scan, for who wants to time it. segmenter: what finds the
     branches where a request names none; only a simulated camera brings their masks along.
     """
@@ -75,6 +76,8 @@ class Hardware:
     arm: Arm
     camera: Camera
     tool_from_camera: FloatArray
+    limits: Limits
+    paths: Mapping[str, Sequence[FloatArray]]
     attachments: Callable[[], Mapping[str, bytes]]
     stage: Stage = lambda name: nullcontext()
     segmenter: str = "recorded"
@@ -124,9 +127,8 @@ def composed(
 
     `hardware_of` brings other hardware than the options name.
     """
-    chosen = hardware_of or (simulated if options.robot is None else _real)
     with ExitStack() as stack:
-        hardware = stack.enter_context(chosen(options))
+        hardware = stack.enter_context((hardware_of or _hardware)(options))
         endpoint = options.bus or f"tcp/127.0.0.1:{free_port()}"
         session = stack.enter_context(open_session(listen=endpoint))
         stack.enter_context(Supervised("worker", worker_command(options, endpoint)))
@@ -136,7 +138,7 @@ def composed(
             RigParts(
                 arm=hardware.arm,
                 camera=hardware.camera,
-                limits=LIMITS,
+                limits=hardware.limits,
                 tool_from_camera=hardware.tool_from_camera,
                 feed=BusFeed(feeder),
                 data=options.data,
@@ -151,12 +153,15 @@ def composed(
         stack.enter_context(rig)
         rig.subscribe(stack.enter_context(Broadcast(session, keys, rig.pose)).event)
         catalogue = stack.enter_context(Catalogue(options.data))
-        yield create_app(rig, catalogue, PATHS, segmenter=hardware.segmenter)
+        caps = SpeedCaps(
+            speed_mps=hardware.limits.speed_mps,
+            acceleration_mps2=hardware.limits.acceleration_mps2,
+        )
+        yield create_app(rig, catalogue, hardware.paths, caps, segmenter=hardware.segmenter)
 
 
-def guarded(host: str) -> Arm:
-    """Return the arm behind a controller, within the limits of the rig."""
-    return GuardedArm(Ur5Arm(Ur5Config(host=host, watchdog_hz=WATCHDOG_HZ)), LIMITS)
+def _hardware(options: ServeOptions) -> AbstractContextManager[Hardware]:
+    return simulated(options) if options.robot is None else real(options.robot)
 
 
 @contextmanager
@@ -164,20 +169,37 @@ def simulated(options: ServeOptions) -> Iterator[Hardware]:
     """Give an arm behind a fake controller, and a camera that sees a grown tree."""
     simulation = prepare(options.orchard)
     with FakeUr(free_host(), time_scale=options.time_scale) as controller:
-        arm = guarded(controller.host)
+        arm = simulated_arm(controller.host)
         camera = SimCamera(lambda: arm.state().pose, simulation, scale=options.picture_scale)
         yield Hardware(
-            arm,
-            camera,
-            simulation.tool_from_camera,
-            lambda: {GROUND_TRUTH: to_json(camera.truth())},
+            arm=arm,
+            camera=camera,
+            tool_from_camera=simulation.tool_from_camera,
+            limits=SIMULATED_LIMITS,
+            paths=SIMULATED_PATHS,
+            attachments=lambda: {GROUND_TRUTH: to_json(camera.truth())},
         )
 
 
+def simulated_arm(host: str) -> Arm:
+    """Return the arm behind a fake controller, within the limits of the simulated cell."""
+    config = Ur5Config(host=host, watchdog_hz=WATCHDOG_HZ)
+    return GuardedArm(Ur5Arm(config), SIMULATED_LIMITS)
+
+
 @contextmanager
-def _real(options: ServeOptions) -> Iterator[Hardware]:
-    arm = guarded(options.robot or "")
-    yield Hardware(arm, OakCamera(), TOOL_FROM_CAMERA, dict, segmenter="unet")
+def real(rig: RigFile) -> Iterator[Hardware]:
+    """Give the arm and the camera that a rig file describes; nothing is opened yet."""
+    limits = rig.guard()
+    yield Hardware(
+        arm=GuardedArm(Ur5Arm(rig.arm_config()), limits),
+        camera=OakCamera(rig.camera_config()),
+        tool_from_camera=rig.camera.tool_from_camera.matrix(),
+        limits=limits,
+        paths=rig.waypoints(),
+        attachments=lambda: {"rig.json": rig.model_dump_json(indent=1).encode()},
+        segmenter="unet",
+    )
 
 
 def worker_command(options: ServeOptions, endpoint: str) -> list[str]:

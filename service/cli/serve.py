@@ -16,7 +16,9 @@ def serve(
     sim: Annotated[
         bool, typer.Option("--sim", help="A simulated arm before a grown tree.")
     ] = False,
-    robot: Annotated[str | None, typer.Option(help="Address of the UR controller.")] = None,
+    robot: Annotated[
+        Path | None, typer.Option(help="Rig file: a real arm and camera; see docs/rig.md.")
+    ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 8000,
     data: Annotated[Path, typer.Option(help="Folder of recordings and catalogue.")] = Path("data"),
@@ -37,15 +39,17 @@ def serve(
     # Only this command needs hardware, simulation and web, which take long to load.
     from mock_hw.orchard.simulate import Options
     from service.compose import ServeOptions, composed
+    from service.rig_file import read_rig_file
     from service.server import make_server
 
     if sim == (robot is not None):
-        raise UsageError("give either --sim or --robot HOST")
+        raise UsageError("give either --sim or --robot FILE, a rig file")
+    rig_file = None if robot is None else read_rig_file(robot)
     require_writable(data)
     compile_kernels((*METHODS, *SEGMENTERS))
     options = ServeOptions(
         data=data,
-        robot=robot,
+        robot=rig_file,
         site=site,
         rig=rig,
         orchard=Options(species=species, topology=topology, leaf_count=leaves, weather="fair"),

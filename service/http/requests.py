@@ -8,19 +8,16 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from canopy_skel.cluster import FARTHEST_M
-from canopy_skel.geometry import FloatArray, rotation_from_quaternion, transform_from
+from canopy_skel.geometry import FloatArray
 from canopy_skel.pipeline import DEFAULT_METHOD, MethodConfig, MethodName
+from service.pose_fields import Fields, Pose, Positive
 from service.rig import PlanRefusedError, ScanSpec
 from service.specs import method_config
 
 MOST_WAYPOINTS = 1000
-_UNIT_TOLERANCE = 0.01
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -35,32 +32,11 @@ class UnknownPathError(ValueError):
     """No path of this name; the message lists those there are."""
 
 
-class Body(BaseModel):
-    """Base of all bodies: a misspelt name is an error, never ignored."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Waypoint(Body):
+class Waypoint(Pose):
     """A pose of the flange (tool0) in base."""
 
-    position: Annotated[tuple[Finite, Finite, Finite], Field(description="metres")]
-    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite]
 
-    @field_validator("quaternion_xyzw")
-    @classmethod
-    def _has_unit_length(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        length = float(np.linalg.norm(value))
-        if abs(length - 1) > _UNIT_TOLERANCE:
-            raise ValueError(f"has length {length:.4g}; give a unit quaternion (x, y, z, w)")
-        return value
-
-    def base_from_tool0(self) -> FloatArray:
-        """Return the pose as (4, 4)."""
-        return transform_from(rotation_from_quaternion(self.quaternion_xyzw), self.position)
-
-
-class PlanBody(Body):
+class PlanBody(Fields):
     """Where to go: a path by name, or waypoints in order; one of both."""
 
     path: Annotated[str | None, Field(description="see `paths` of GET /v1/rig")] = None
@@ -116,7 +92,7 @@ class ScanBody(PlanBody):
         return self
 
 
-class AcknowledgeBody(Body):
+class AcknowledgeBody(Fields):
     """Why it is safe to move again."""
 
     reason: Annotated[str, Field(min_length=3, max_length=500, pattern=r"\S")]
@@ -170,7 +146,7 @@ def scan_spec(
 
 def _waypoints(body: PlanBody, paths: Mapping[str, Sequence[ArrayLike]]) -> tuple[FloatArray, ...]:
     if body.waypoints is not None:
-        return tuple(waypoint.base_from_tool0() for waypoint in body.waypoints)
+        return tuple(waypoint.matrix() for waypoint in body.waypoints)
     if body.path is None or body.path not in paths:
         known = ", ".join(sorted(paths)) or "none"
         raise UnknownPathError(f"there is no path {body.path!r}; choose one of: {known}")

@@ -25,8 +25,8 @@ from mock_hw.orchard.path import TOOL_FROM_CAMERA
 from mock_hw.orchard.simulate import Options, prepare
 from mock_hw.sim_camera import SimCamera
 from service.compose import (
-    LIMITS,
-    PATHS,
+    SIMULATED_LIMITS,
+    SIMULATED_PATHS,
     Hardware,
     ServeOptions,
     composed,
@@ -39,6 +39,7 @@ ORCHARD = Options(species="apple", leaf_count=200, weather="fair", rows=False)
 TIME_SCALE = 20
 PICTURE_SCALE = 0.2
 CANOPY = Path(sys.executable).with_name("canopy")
+RIG_PAGE = Path(__file__).parents[2] / "docs/rig.md"
 
 
 class Rig:
@@ -62,7 +63,7 @@ class Rig:
 
     def start_slowly(self):
         """A scan of three waypoints, with a third of a second on the way to each."""
-        poses = PATHS["orchard-70"][:3]
+        poses = SIMULATED_PATHS["orchard-70"][:3]
         return self.start(waypoints=[waypoint(pose) for pose in poses], speed_mps=0.02)
 
     def status(self, scan_id):
@@ -155,6 +156,17 @@ class Rig:
         wait_until_ready(self.http)
 
 
+def rig_file(folder, *changes):
+    """Write the rig file of the documentation, with (old, new) changes; return its path."""
+    text = re.search(r"```toml\n(.*?)```", RIG_PAGE.read_text(), re.DOTALL).group(1)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "rig.toml"
+    path.write_text(text)
+    return path
+
+
 def environment():
     """Have a process find the modules that we find, not those installed elsewhere."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -184,14 +196,18 @@ def hardware_at(host, camera=None):
     """An arm at a controller and, unless another camera is given, the simulated one."""
     # More patient than the rig's: a busy machine is silent for a moment, too.
     patient = Ur5Config(host=host, watchdog_hz=1.0, stale_after_s=0.8)
-    arm = GuardedArm(Ur5Arm(patient), LIMITS)
+    arm = GuardedArm(Ur5Arm(patient), SIMULATED_LIMITS)
+    cell = {"arm": arm, "limits": SIMULATED_LIMITS, "paths": SIMULATED_PATHS}
     if camera is not None:
-        yield Hardware(arm, camera, TOOL_FROM_CAMERA, dict)
+        yield Hardware(camera=camera, tool_from_camera=TOOL_FROM_CAMERA, attachments=dict, **cell)
         return
     simulation = prepare(ORCHARD)
     sim = SimCamera(lambda: arm.state().pose, simulation, scale=PICTURE_SCALE)
     yield Hardware(
-        arm, sim, simulation.tool_from_camera, lambda: {GROUND_TRUTH: to_json(sim.truth())}
+        camera=sim,
+        tool_from_camera=simulation.tool_from_camera,
+        attachments=lambda: {GROUND_TRUTH: to_json(sim.truth())},
+        **cell,
     )
 
 
@@ -208,7 +224,7 @@ def options_for(data):
 
 
 @contextmanager
-def served(data, camera=None, version="3.15"):
+def served(data, camera=None, version="3.15", hardware_at=hardware_at):
     """Serve in this process, before a controller of its own."""
     with (
         FakeUr(free_host(), version=version, time_scale=TIME_SCALE) as controller,

@@ -14,6 +14,7 @@ from live_rig import (
     CANOPY,
     Service,
     problem,
+    rig_file,
     served,
     wait_for,
     wait_until_answering,
@@ -21,10 +22,10 @@ from live_rig import (
 )
 
 from mock_hw.fake_ur.process import FakeUr, free_host
-from service.compose import PATHS
+from service.compose import SIMULATED_PATHS
 
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
-HERE = PATHS["orchard-70"][0]
+HERE = SIMULATED_PATHS["orchard-70"][0]
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,7 @@ def test_without_a_worker_scans_run_and_their_skeletons_are_pending(shared):
     worker = next(part for part in ready.json()["parts"] if part["name"] == "worker")
     assert not worker["ready"]
     assert absent in worker["detail"]
-    scan_id = shared.start(waypoints=[waypoint(pose) for pose in PATHS["orchard-70"][:3]])
+    scan_id = shared.start(waypoints=[waypoint(pose) for pose in SIMULATED_PATHS["orchard-70"][:3]])
     second = shared.post()
     assert problem(second, 409) == "rig_busy"
     assert scan_id in second.json()["detail"]
@@ -159,13 +160,12 @@ def test_a_robot_without_a_camera_starts_nothing_and_says_what_to_do(tmp_path):
     installed = importlib.util.find_spec("depthai") is not None
     mend = "check cable, power and network" if installed else "pip install 'canopy-skel[oak]'"
     with FakeUr(free_host(), time_scale=20) as controller:
-        service = Service(
-            tmp_path, [CANOPY, "serve", "--data", tmp_path, "--robot", controller.host]
-        )
+        robot = rig_file(tmp_path, ("192.168.0.10", controller.host))
+        service = Service(tmp_path, [CANOPY, "serve", "--data", tmp_path, "--robot", robot])
         rig = service.launch()
         try:
             joints = controller.do("state")["joints_rad"]
-            for answer in (rig.http.get("/readyz"), rig.post()):
+            for answer in (rig.http.get("/readyz"), rig.post("look")):
                 assert problem(answer, 503) in ("not_ready", "rig_not_ready")
                 assert answer.json()["detail"].startswith("camera: NoCameraError")
                 assert mend in answer.json()["detail"]
