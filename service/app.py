@@ -5,7 +5,7 @@ from contextlib import asynccontextmanager
 from importlib import resources
 from importlib.metadata import version
 
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from service.http import planners as planner_routes
 from service.http import rig as rig_routes
 from service.http import scans as scan_routes
 from service.http import skeletons as skeleton_routes
+from service.http.access import Access, refuse_unknown_names
 from service.http.context import Context
 from service.http.problems import RESPONSES, add_handlers
 from service.http.requests import SpeedCaps
@@ -32,6 +33,7 @@ def create_app(
     caps: SpeedCaps | None = None,
     *,
     segmenter: str = "recorded",
+    access: Access | None = None,
 ) -> FastAPI:
     """Return the app; its lifespan recovers the catalogue and follows the rig's events.
 
@@ -41,6 +43,7 @@ def create_app(
         paths: base_from_tool0 (4, 4) waypoints by the name that `path` in a request gives.
         caps: the fastest that may be asked for.
         segmenter: what finds the branches of a scan whose request names none.
+        access: who is let in; everybody who comes by IP address or `localhost`, without it.
     """
     bell = Bell()
     scans = Scans(rig, catalogue, bell)
@@ -68,10 +71,12 @@ def create_app(
         caps=caps or SpeedCaps(),
         segmenter=segmenter,
     )
+    app.state.access = access or Access()
     add_handlers(app)
+    app.include_router(rig_routes.stop_router)
     routes = (rig_routes, metric_routes, scan_routes, planner_routes, skeleton_routes)
     for router in (_page, *(module.router for module in routes)):
-        app.include_router(router)
+        app.include_router(router, dependencies=[Depends(refuse_unknown_names)])
     app.mount("/console", StaticFiles(packages=[("service", "console")]))
     return app
 

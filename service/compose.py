@@ -5,7 +5,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -27,6 +27,7 @@ from service.broadcast import Broadcast
 from service.bus import Keys, open_session
 from service.catalogue import Catalogue
 from service.feeder import ScanSource, ViewFeeder
+from service.http.access import Access
 from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
 from service.rig import PartStatus, ScanSpec
@@ -51,7 +52,8 @@ class ServeOptions:
 
     robot: the real rig; None = simulation, of which `orchard` says what stands there,
     `time_scale` how much faster than real the arm moves and `picture_scale` the size of pictures.
-    bus: where the bus listens, such as "tcp/127.0.0.1:7447"; None = on a free port.
+    bus: where the bus listens, such as "tcp/127.0.0.1:7447"; None = on a free port. access: who is
+    let in over HTTP.
     """
 
     data: Path
@@ -62,6 +64,7 @@ class ServeOptions:
     time_scale: float
     picture_scale: float
     bus: str | None = None
+    access: Access = field(default_factory=Access)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -157,7 +160,14 @@ def composed(
             speed_mps=hardware.limits.speed_mps,
             acceleration_mps2=hardware.limits.acceleration_mps2,
         )
-        yield create_app(rig, catalogue, hardware.paths, caps, segmenter=hardware.segmenter)
+        yield create_app(
+            rig,
+            catalogue,
+            hardware.paths,
+            caps,
+            segmenter=hardware.segmenter,
+            access=options.access,
+        )
 
 
 def _hardware(options: ServeOptions) -> AbstractContextManager[Hardware]:

@@ -58,6 +58,7 @@ def scan(
     body: Mapping[str, Any],
     progress: Callable[[ScanEvent], None],
     *,
+    key: str | None = None,
     patience_s: float = 10.0,
     skeleton_timeout_s: float = 120.0,
 ) -> ScanResult:
@@ -67,6 +68,7 @@ def scan(
         url: of the service, such as http://127.0.0.1:8000.
         body: see POST /v1/scans.
         progress: called for every event, in order.
+        key: of the service, if it has one.
         patience_s: how long the service may be unreachable before this gives up.
         skeleton_timeout_s: how long the worker may need after the last view.
 
@@ -74,7 +76,7 @@ def scan(
         RefusedError: the service refused; nothing moved.
         UnreachableServiceError: the service did not answer; the scan may go on without us.
     """
-    with ScanClient(url, patience_s=patience_s) as client:
+    with ScanClient(url, key=key, patience_s=patience_s) as client:
         scan_id = client.start(body, key=str(uuid4()))
         for event in client.follow(scan_id):
             progress(event)
@@ -96,10 +98,11 @@ def fetch(url: str, path: str) -> bytes:
 class ScanClient:
     """Talks to one service; requests that may be repeated are, for `patience_s`."""
 
-    def __init__(self, url: str, *, patience_s: float = 10.0) -> None:
+    def __init__(self, url: str, *, key: str | None = None, patience_s: float = 10.0) -> None:
         self._url = url
         self._patience_s = patience_s
-        self._http = httpx2.Client(base_url=url, timeout=_SILENCE_S)
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        self._http = httpx2.Client(base_url=url, timeout=_SILENCE_S, headers=headers)
 
     def __enter__(self) -> Self:
         """Return itself; connections are made when they are needed."""

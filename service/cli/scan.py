@@ -1,12 +1,14 @@
 """`canopy scan`."""
 
 import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
+from service.access_keys import read_key
 from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
 from service.outputs import require_writable, write_all
 from service.rig import ScanStatus
@@ -31,6 +33,9 @@ def scan(
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
     ] = False,
     url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
+    key_file: Annotated[
+        Path | None, typer.Option(help="File with the service's key, if it has one.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Start a scan over HTTP, show how it goes, and fetch its recording and skeleton."""
@@ -39,6 +44,7 @@ def scan(
     from service.scan_client import scan as run_scan
 
     require_writable(output)
+    key = None if key_file is None else read_key(key_file)
     with progress_bars() as progress:
         task = progress.add_task(tree, total=None)
 
@@ -57,7 +63,7 @@ def scan(
             "farthest_m": farthest,
             "rooted": rooted,
         }
-        result = run_scan(url, body, show)
+        result = run_scan(url, body, show, key=key)
     status = result.status
     contents = {f"{status.scan_id}.mcap": fetch(url, f"/v1/scans/{status.scan_id}/recording.mcap")}
     if result.skeleton is not None:

@@ -1,15 +1,20 @@
 """`canopy serve` and `canopy worker`."""
 
 from pathlib import Path
-from typing import Annotated
+from socket import gethostname
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from canopy_skel.errors import UsageError
 from canopy_skel.pipeline import METHODS
+from service.access_keys import reaches_others, read_key
 from service.kernels import compile_kernels
 from service.outputs import require_writable
 from service.skeletons import SEGMENTERS
+
+if TYPE_CHECKING:
+    from service.http.access import Access
 
 
 def serve(
@@ -21,6 +26,13 @@ def serve(
     ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 8000,
+    key_file: Annotated[
+        Path | None,
+        typer.Option(help="File with the key that commands must bring; needed beyond 127.0.0.1."),
+    ] = None,
+    name: Annotated[
+        list[str] | None, typer.Option(help="Host name it is known by; may be repeated.")
+    ] = None,
     data: Annotated[Path, typer.Option(help="Folder of recordings and catalogue.")] = Path("data"),
     site: Annotated[str, typer.Option(help="Name of the site on the bus.")] = "orchard",
     rig: Annotated[str, typer.Option(help="Name of the rig on the bus.")] = "rig-1",
@@ -45,6 +57,7 @@ def serve(
     if sim == (robot is not None):
         raise UsageError("give either --sim or --robot FILE, a rig file")
     rig_file = None if robot is None else read_rig_file(robot)
+    access = _access(host, key_file, name or [])
     require_writable(data)
     compile_kernels((*METHODS, *SEGMENTERS))
     options = ServeOptions(
@@ -56,9 +69,28 @@ def serve(
         time_scale=time_scale,
         picture_scale=picture_scale,
         bus=bus,
+        access=access,
     )
     with composed(options) as service:
         make_server(service, host=host, port=port).run()
+
+
+def _access(host: str, key_file: Path | None, names: list[str]) -> "Access":
+    """Return who is let in where the service listens on `host`."""
+    # Imported here: only serving needs the web.
+    from service.http.access import Access
+
+    others = reaches_others(host)
+    if others and key_file is None:
+        raise UsageError(
+            f"--host {host} lets others reach the arm: give --key-file FILE, with a key that"
+            " commands must bring along"
+        )
+    own = [gethostname(), f"{gethostname()}.local"] if others else []
+    return Access(
+        names=frozenset(name.lower() for name in (*names, *own)),
+        key=None if key_file is None else read_key(key_file),
+    )
 
 
 def worker(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:

@@ -12,16 +12,27 @@ let chosen = null;
 let stream = new AbortController();
 
 async function ask(path, options) {
-  const answer = await fetch(path, options);
+  let answer = await fetch(path, options);
+  if (answer.status === 401) {
+    const key = prompt("This rig wants its key:");
+    if (key) sessionStorage.setItem("key", key.trim());
+    if (key) answer = await fetch(path, withKey(options));
+  }
   const body = await answer.json();
   if (!answer.ok) throw new Error(`${body.title}: ${body.detail}`);
   return body;
 }
 
+function withKey(options) {
+  const key = sessionStorage.getItem("key");
+  if (!key) return options;
+  return { ...options, headers: { ...options.headers, Authorization: `Bearer ${key}` } };
+}
+
 function post(path, body, headers = {}) {
-  if (body === undefined) return ask(path, { method: "POST" });
+  if (body === undefined) return ask(path, withKey({ method: "POST" }));
   headers = { "Content-Type": "application/json", ...headers };
-  return ask(path, { method: "POST", headers, body: JSON.stringify(body) });
+  return ask(path, withKey({ method: "POST", headers, body: JSON.stringify(body) }));
 }
 
 async function attempt(action) {

@@ -3,13 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
-from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
 from numpy.typing import ArrayLike
 
 from service.bell import Bell
-from service.http.problems import Problem
 from service.http.requests import SpeedCaps
 from service.pictures import Pictures
 from service.rig import Rig
@@ -43,12 +41,3 @@ def known_scan(scan_id: str, here: Here) -> str:
 
 
 KnownScan = Annotated[str, Depends(known_scan)]
-
-
-async def refuse_foreign_pages(request: Request) -> None:
-    """Refuse what a web page of another site makes a browser send: it must not move the arm."""
-    origin = request.headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != request.headers.get("host"):
-        raise Problem(
-            403, "foreign_origin", "Not from this page", f"{origin} may not command this rig"
-        )

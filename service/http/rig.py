@@ -3,15 +3,18 @@
 import asyncio
 from typing import Any
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter
 
-from service.http.context import Here, refuse_foreign_pages
+from service.http.access import COMMAND
+from service.http.context import Here
 from service.http.problems import Problem
 from service.http.requests import AcknowledgeBody, PlanBody, plan_spec
 from service.rig import PartStatus
 from service.scans import status_fields
 
 router = APIRouter(tags=["rig"])
+stop_router = APIRouter(tags=["rig"])
+"""Of its own, because nothing that guards the others may keep anybody from stopping the arm."""
 OPTIONAL_PARTS = frozenset({"worker"})
 
 
@@ -47,21 +50,21 @@ def show_rig(here: Here) -> dict[str, Any]:
     }
 
 
-@router.post("/v1/rig:stop")
+@stop_router.post("/v1/rig:stop")
 async def stop(here: Here) -> dict[str, str]:
     """Stop the arm now; no condition, never queued, harmless when repeated."""
     await asyncio.to_thread(here.rig.stop)  # not in the pool that other requests may fill
     return {"status": "stopped"}
 
 
-@router.post("/v1/rig:acknowledge", dependencies=[Depends(refuse_foreign_pages)])
+@router.post("/v1/rig:acknowledge", dependencies=COMMAND)
 def acknowledge(body: AcknowledgeBody, here: Here) -> dict[str, str]:
     """Let the arm move again after a stop: an operator has looked and says why it is safe."""
     here.rig.acknowledge(body.reason)
     return {"status": "acknowledged"}
 
 
-@router.post("/v1/plans", dependencies=[Depends(refuse_foreign_pages)])
+@router.post("/v1/plans", dependencies=COMMAND)
 def plan(body: PlanBody, here: Here) -> dict[str, Any]:
     """Tell for every waypoint whether the arm can drive there; nothing moves."""
     verdicts = here.rig.plan(plan_spec(body, here.paths, here.caps))

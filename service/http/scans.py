@@ -12,7 +12,8 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.bell import wait_for_ring
 from service.catalogue import MOST_NUMBER, EventRecord, ScanRecord
-from service.http.context import Context, Here, KnownScan, refuse_foreign_pages
+from service.http.access import COMMAND
+from service.http.context import Context, Here, KnownScan
 from service.http.problems import Problem
 from service.http.requests import ScanBody, scan_spec
 from service.pictures import NoPictureError, PictureKind, recorded_file
@@ -23,7 +24,6 @@ router = APIRouter(prefix="/v1/scans", tags=["scans"])
 _LOOK_AGAIN_S = 5.0
 # A rig says that a scan has ended before it tells the events that led there.
 _LAST_WORDS_S = 0.3
-_COMMAND = [Depends(refuse_foreign_pages)]
 
 
 def idempotency_key(
@@ -40,7 +40,7 @@ def idempotency_key(
     return idempotency_key
 
 
-@router.post("", status_code=202, dependencies=_COMMAND)
+@router.post("", status_code=202, dependencies=COMMAND)
 def start_scan(
     body: ScanBody, key: Annotated[str, Depends(idempotency_key)], here: Here
 ) -> JSONResponse:
@@ -79,19 +79,19 @@ def _rfc3339(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="milliseconds")
 
 
-@router.post("/{scan_id}:pause", dependencies=_COMMAND)
+@router.post("/{scan_id}:pause", dependencies=COMMAND)
 def pause_scan(scan_id: str, here: Here) -> dict[str, Any]:
     """Stop the arm and keep the scan."""
     return status_fields(here.scans.pause(scan_id))
 
 
-@router.post("/{scan_id}:resume", dependencies=_COMMAND)
+@router.post("/{scan_id}:resume", dependencies=COMMAND)
 def resume_scan(scan_id: str, here: Here) -> dict[str, Any]:
     """Go on at the first waypoint that is missing."""
     return status_fields(here.scans.resume(scan_id))
 
 
-@router.post("/{scan_id}:cancel", dependencies=_COMMAND)
+@router.post("/{scan_id}:cancel", dependencies=COMMAND)
 def cancel_scan(scan_id: str, here: Here) -> dict[str, Any]:
     """Stop the arm and end the scan; its recording stays."""
     return status_fields(here.scans.cancel(scan_id))

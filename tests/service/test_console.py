@@ -6,6 +6,8 @@ import pytest
 from live_service import serving, skeleton, wait_until
 from playwright.sync_api import expect, sync_playwright
 
+from service.http.access import Access
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking"]
 INK = """canvas => {
@@ -71,3 +73,34 @@ def test_a_refused_start_says_why(page, tmp_path):
         page.get_by_label("Tree").fill("another")
         page.get_by_role("button", name="Start").click()
         expect(page.get_by_role("alert")).to_contain_text("is under way; wait or cancel it")
+
+
+def test_the_page_asks_for_the_key_of_the_rig_once(page, tmp_path):
+    asked = []
+
+    def give(dialog):
+        asked.append(dialog.message)
+        dialog.accept(" 0123456789abcdef " if "key" in dialog.message else "way is clear")
+
+    page.on("dialog", give)
+    with serving(tmp_path, access=Access(key="0123456789abcdef")) as live:
+        page.goto(live.url)
+        page.get_by_label("Tree").fill("row3-tree12")
+        page.get_by_role("button", name="Start").click()
+        expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
+        page.get_by_role("button", name="Acknowledge").click()
+        wait_until(lambda: live.rig.acknowledged == ["way is clear"])
+    assert [message for message in asked if "key" in message] == ["This rig wants its key:"]
+
+
+def test_a_wrong_key_is_said_to_be_one_and_asked_for_again(page, tmp_path):
+    given = iter(["wrong", "0123456789abcdef"])
+    page.on("dialog", lambda dialog: dialog.accept(next(given)))
+    with serving(tmp_path, access=Access(key="0123456789abcdef")) as live:
+        page.goto(live.url)
+        page.get_by_label("Tree").fill("row3-tree12")
+        page.get_by_role("button", name="Start").click()
+        expect(page.get_by_role("alert")).to_contain_text("this is another one")
+        page.get_by_role("button", name="Start").click()
+        expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
+        assert len(live.rig.specs) == 1

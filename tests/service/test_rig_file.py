@@ -74,7 +74,7 @@ def test_a_file_that_is_not_there_or_not_text_is_refused(tmp_path):
         read_rig_file(tmp_path / "rig.toml")
 
 
-def test_a_served_rig_has_the_limits_and_paths_of_its_file_and_no_others(tmp_path):
+def test_a_served_rig_has_the_limits_and_paths_of_its_file_and_wants_its_key(tmp_path):
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
     with FakeUr(free_host()) as controller:
         path = rig_file(
@@ -82,13 +82,19 @@ def test_a_served_rig_has_the_limits_and_paths_of_its_file_and_no_others(tmp_pat
             ("192.168.0.10", controller.host),
             ("speed_mps = 0.25", "speed_mps = 0.12"),
         )
+        key = tmp_path / "key"
+        key.write_text("0123456789abcdef\n")
         command = [CANOPY, "serve", "--robot", path, "--data", tmp_path / "data"]
+        command += ["--key-file", key, "--name", "rig-3"]
         service = Service(tmp_path / "data", command, controller)
         rig = service.launch()
         try:
             shown = rig.http.get("/v1/rig").json()
             assert shown["paths"] == {"look": 2}
             assert shown["caps"] == {"speed_mps": 0.12, "acceleration_mps2": 0.5}
+            assert rig.http.get("/v1/rig", headers={"Host": "rig-3:8000"}).status_code == 200
+            assert problem(rig.post("look"), 401) == "key_required"
+            rig.http.headers["Authorization"] = "Bearer 0123456789abcdef"
             plan = rig.http.post("/v1/plans", json={"path": "look"}).json()
             assert plan["feasible"], plan
             below = np.array(SIMULATED_PATHS["orchard-10"][0])
