@@ -5,6 +5,7 @@ import sys
 import typer
 
 from canopy_skel.errors import CanopyError, UsageError
+from service.cli.calibrate import calibrate
 from service.cli.coco import coco
 from service.cli.doctor import doctor
 from service.cli.experiment import experiment
@@ -38,6 +39,7 @@ for verb in (
     export,
     serve,
     scan,
+    calibrate,
     simulate,
     coco,
     segment,
