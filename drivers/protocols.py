@@ -257,6 +257,8 @@ class Stillness:
 def wait_settled(arm: Arm, *, timeout_s: float, still: Stillness | None = None) -> ArmState:
     """Wait until the move under way has ended and the arm stands still; return its state then.
 
+    timeout_s: for the whole rest of the move, so travel counts; see `drivers.waypoints.travel_s`.
+
     Raises:
         SettleTimeoutError: it still moves after `timeout_s`.
         ArmError: the move ended in another way; the type says how.
@@ -274,7 +276,7 @@ def wait_settled(arm: Arm, *, timeout_s: float, still: Stillness | None = None) 
             return state
         time.sleep(0.002)
     raise SettleTimeoutError(
-        f"the arm did not come to rest within {timeout_s} s; stop it or allow more time"
+        f"the arm did not come to rest within {timeout_s:.1f} s; stop it or allow more time"
     )
 
 

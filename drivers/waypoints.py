@@ -1,5 +1,6 @@
 """From where the arm is to the next waypoint: a move that is allowed all the way, or the reason."""
 
+import math
 from dataclasses import replace
 from itertools import product
 
@@ -123,3 +124,25 @@ def after(state: ArmState, move: Move) -> ArmState:
         tool_speed_mps=0.0,
         mode=ArmMode.READY,
     )
+
+
+def travel_s(state: ArmState, move: Move) -> float:
+    """Return how many seconds a move from `state` takes at most, if nothing slows it down.
+
+    Speeds of a line are of metres and, as controllers turn the tool with the same number, of
+    radians too; which of both leads is theirs to say, so here one comes after the other.
+    """
+    if isinstance(move, JointMove):
+        turn_rad = float(np.abs(move.joints_rad - state.joints_rad).max())
+        return _ramped_s(turn_rad, move.speed_rps, move.acceleration_rps2)
+    start, end = state.pose.base_from_tool0, move.base_from_tool0
+    turn = kinematics.rotation_vector(kinematics.relative_turn(start, end))
+    way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]) + np.linalg.norm(turn))
+    return _ramped_s(way, move.speed_mps, move.acceleration_mps2)
+
+
+def _ramped_s(way: float, speed: float, acceleration: float) -> float:
+    """Return the duration of speeding up, cruising and slowing down; short ways have no cruise."""
+    if way * acceleration < speed**2:
+        return 2 * math.sqrt(way / acceleration)
+    return way / speed + speed / acceleration

@@ -30,13 +30,16 @@ from drivers.protocols import (
     wait_settled,
 )
 from drivers.quality import QualityLimits, flaws, moved
-from drivers.waypoints import moves_to
+from drivers.waypoints import moves_to, travel_s
 from service.rig import ScanSpec, ScanState, ScanStatus
 
 log = logging.getLogger(__name__)
 
 Report = Callable[[str, dict[str, object]], None]
 Stage = Callable[[str], AbstractContextManager[None]]
+
+SLOWED_DOWN = 2.0
+"""Times the planned duration that a move may take: the pendant's slider slows moves down."""
 
 
 class ScanInterruptedError(Exception):
@@ -231,7 +234,8 @@ class ScanSession:
                 self._check_wanted()
                 arm.start_move(move)
             with stage("settle"):
-                state = wait_settled(arm, timeout_s=spec.settle_timeout_s)
+                timeout_s = SLOWED_DOWN * travel_s(state, move) + spec.settle_timeout_s
+                state = wait_settled(arm, timeout_s=timeout_s)
         return state
 
     def _capture(self, index: int, before: ArmState, writer: RecordingWriter) -> View:

@@ -14,7 +14,7 @@ from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.geometry import FloatArray
 from canopy_skel.pipeline import DEFAULT_METHOD, MethodConfig, MethodName
 from service.pose_fields import Fields, Pose, Positive
-from service.rig import PlanRefusedError, ScanSpec
+from service.rig import GENTLEST_MPS2, SLOWEST_MPS, PlanRefusedError, ScanSpec
 from service.specs import method_config
 
 MOST_WAYPOINTS = 1000
@@ -44,9 +44,13 @@ class PlanBody(Fields):
         None
     )
     speed_mps: Annotated[
-        Positive | None, Field(description="of the flange; default 0.25 m/s or the cap")
+        Positive | None,
+        Field(description=f"of the flange, from {SLOWEST_MPS}; default 0.25 m/s or the cap"),
     ] = None
-    acceleration_mps2: Positive | None = None
+    acceleration_mps2: Annotated[
+        Positive | None,
+        Field(description=f"of the flange, from {GENTLEST_MPS2}; default 0.5 m/s² or the cap"),
+    ] = None
 
     @model_validator(mode="after")
     def _has_one_of_both(self) -> Self:
@@ -105,7 +109,7 @@ def plan_spec(
 
     Raises:
         UnknownPathError: there is no path of this name.
-        PlanRefusedError: a speed is over its cap.
+        PlanRefusedError: a speed is over its cap, or too low.
     """
     usual = SpeedCaps()
     return ScanSpec(

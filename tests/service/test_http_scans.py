@@ -104,6 +104,24 @@ def test_speeds_over_the_cap_are_refused_before_the_rig_hears_of_them(tmp_path, 
         live.start(**{name: 0.2})
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "least"),
+    [
+        ("speed_mps", 1e-300, "0.005"),
+        ("speed_mps", 0.0049, "0.005"),
+        ("acceleration_mps2", 1e-300, "0.01"),
+        ("acceleration_mps2", 0.0099, "0.01"),
+    ],
+)
+@pytest.mark.parametrize("route", ["/v1/plans", "/v1/scans"])
+def test_moves_that_would_take_for_ever_are_refused(idle, route, name, value, least):
+    body = {"path": "short", name: value} | ({"tree_id": "t"} if route == "/v1/scans" else {})
+    answer = idle.http.post(route, json=body, headers={"Idempotency-Key": "slow"})
+    detail = problem(answer, 422, "plan_refused")["detail"]
+    assert detail == f"{name} {value:g} is under {least}; ask for more"
+    assert not idle.rig.specs
+
+
 def test_an_unknown_path_is_refused_with_those_there_are(idle):
     body = problem(idle.post_scan(path="orchard-11"), 422, "unknown_path")
     assert "choose one of: short" in body["detail"]

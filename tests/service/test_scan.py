@@ -1,7 +1,9 @@
 """Scans through the real ur-rtde client against the fake controller."""
 
+import re
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from scenes.wood import view_from
 from canopy_skel.geometry import invert
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
+from drivers import kinematics
 from drivers.errors import CameraTimeoutError
 from drivers.guarded_arm import GuardedArm, Limits
 from drivers.protocols import CameraImage
@@ -343,6 +346,28 @@ def test_a_controller_that_was_silent_for_a_moment_does_not_finish_its_move(rig,
     with pytest.raises(RigNotReadyError, match="acknowledge"):
         rig.resume("scan-1")
     rig.acknowledge("looked")
+    assert_stands_still(fake)
+
+
+def test_a_slow_move_is_waited_for(rig):
+    """The time to settle begins when the move should have ended."""
+    began_s = time.perf_counter()
+    rig.start(spec(waypoints=WAYPOINTS[-1:], speed_mps=0.02, settle_timeout_s=0.2))
+    status = wait_for(rig, "scan-1", ScanState.DONE, ScanState.STOPPED)
+    assert (status.state, status.detail) == (ScanState.DONE, "")
+    assert time.perf_counter() - began_s > 0.4
+
+
+def test_a_move_that_does_not_end_is_stopped(rig, fake, monkeypatch):
+    near = kinematics.forward(fake.do("state")["joints_rad"])
+    near[2, 3] -= 0.05
+    arm = rig._parts.arm
+    start_move = arm.start_move
+    monkeypatch.setattr(arm, "start_move", lambda move: start_move(replace(move, speed_mps=1e-4)))
+    rig.start(spec(waypoints=(near,), settle_timeout_s=0.2))
+    status = wait_for(rig, "scan-1", ScanState.DONE, ScanState.STOPPED)
+    assert status.state is ScanState.STOPPED
+    assert re.search(r"SettleTimeoutError: the arm did not come to rest within \d+", status.detail)
     assert_stands_still(fake)
 
 

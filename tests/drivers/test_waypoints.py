@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from contracts.arm import down, joint, linear
+
+from drivers import kinematics
+from drivers.protocols import ArmMode, ArmState, ToolPose
+from drivers.waypoints import READY_JOINTS_RAD, travel_s
+from mock_hw.fake_ur.motion import JointWay, LineWay, Motion
+
+STANDING = ArmState(
+    pose=ToolPose(stamp_ns=0, base_from_tool0=kinematics.forward(READY_JOINTS_RAD)),
+    joints_rad=READY_JOINTS_RAD,
+    joint_speeds_rps=np.zeros(6),
+    tool_speed_mps=0.0,
+    mode=ArmMode.READY,
+)
+
+
+def turned(angle_rad):
+    pose = down(STANDING, 0.0)
+    pose[:3, :3] = pose[:3, :3] @ kinematics.rotation_from_vector(np.array([0, 0, angle_rad]))
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("target", "speed_mps", "acceleration_mps2"),
+    [(down(STANDING, way_m), v, a) for way_m in (0, 0.01, 0.3) for v, a in [(0.25, 0.5), (0.02, 9)]]
+    + [(turned(angle_rad), 0.1, 0.1) for angle_rad in (0.05, 1.0, 3.0)],
+)
+def test_a_line_is_given_as_long_as_it_takes(target, speed_mps, acceleration_mps2):
+    way = LineWay(STANDING.pose.base_from_tool0, target, np.eye(4))
+    took_s = duration_s(Motion(way=way, speed=speed_mps, acceleration=acceleration_mps2))
+    allowed_s = travel_s(STANDING, linear(target, speed_mps, acceleration_mps2))
+    assert allowed_s == pytest.approx(took_s, abs=0.02)
+
+
+@pytest.mark.parametrize(("speed_rps", "acceleration_rps2"), [(0.8, 1.0), (0.1, 0.2)])
+@pytest.mark.parametrize("turn_rad", [0.01, 3.0])
+def test_a_joint_move_is_given_as_long_as_its_leading_joint_takes(
+    turn_rad, speed_rps, acceleration_rps2
+):
+    target = READY_JOINTS_RAD + np.array([0.1, -1.0, 0.5, 0.0, 0.0, 0.2]) * turn_rad
+    way = JointWay(READY_JOINTS_RAD, target)
+    took_s = duration_s(Motion(way=way, speed=speed_rps, acceleration=acceleration_rps2))
+    allowed_s = travel_s(STANDING, joint(target, speed_rps, acceleration_rps2))
+    assert allowed_s == pytest.approx(took_s, abs=0.02)
+
+
+def test_a_line_that_turns_is_given_time_for_both():
+    target = turned(1.0)
+    target[2, 3] -= 0.5
+    assert travel_s(STANDING, linear(target, 0.1, 1.0)) == pytest.approx(1.5 / 0.1 + 0.1)
+
+
+def duration_s(motion):
+    steps = 0
+    while not motion.done:
+        motion.advance(0.008)
+        steps += 1
+    return 0.008 * steps
