@@ -133,7 +133,7 @@ class LocalRig:
                 state = after(state, move)
         return verdicts
 
-    def start(self, spec: ScanSpec) -> ScanStatus:
+    def start(self, spec: ScanSpec, views_before: int = 0) -> ScanStatus:
         """Begin a scan; see `Rig.start`."""
         with self._lock:
             stops = self._stops
@@ -147,7 +147,7 @@ class LocalRig:
                     f" waypoint {bad[0].index}: {bad[0].reason}",
                     verdicts,
                 )
-            return self._launch(spec, stops)
+            return self._launch(spec, stops, views_before)
 
     def pause(self, scan_id: str) -> ScanStatus:
         """Stop the arm and keep the scan."""
@@ -164,7 +164,7 @@ class LocalRig:
                 raise RigNotReadyError(f"scan {scan_id} is {session.status.state}; start a new one")
             self._require_free()
             self._require_ready()
-            return self._launch(spec, stops)
+            return self._launch(spec, stops, session.status.views_done)
 
     def cancel(self, scan_id: str) -> ScanStatus:
         """Stop the arm and end the scan; what was recorded stays."""
@@ -246,12 +246,12 @@ class LocalRig:
         """Tell the listeners of something that happened elsewhere, such as a new skeleton."""
         self._tell(scan_id, kind, fields)
 
-    def _launch(self, spec: ScanSpec, stops: int) -> ScanStatus:
+    def _launch(self, spec: ScanSpec, stops: int, views_before: int) -> ScanStatus:
         """Start a session, unless the arm was stopped since `stops` was read.
 
         The session is there to be stopped before that is looked at: no stop falls in between.
         """
-        session = self._session_for(spec)
+        session = self._session_for(spec, views_before)
         session.path.parent.mkdir(parents=True, exist_ok=True)
         before = self._sessions.get(spec.scan_id)
         self._sessions[spec.scan_id] = (spec, session)
@@ -269,7 +269,7 @@ class LocalRig:
             raise
         return session.status
 
-    def _session_for(self, spec: ScanSpec) -> ScanSession:
+    def _session_for(self, spec: ScanSpec, views_before: int) -> ScanSession:
         parts = self._parts
         return ScanSession(
             spec,
@@ -285,6 +285,7 @@ class LocalRig:
             report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),
             recorded=lambda index: parts.feed.offer(spec.scan_id, index),
             conclude_with=self._conclude,
+            views_before=views_before,
         )
 
     def _conclude(self, state: ScanState, detail: str) -> None:

@@ -128,8 +128,11 @@ class Rig(Protocol):
         """Check every waypoint; nothing moves."""
         ...
 
-    def start(self, spec: ScanSpec) -> ScanStatus:
+    def start(self, spec: ScanSpec, views_before: int = 0) -> ScanStatus:
         """Begin a scan and return; events tell how it goes.
+
+        views_before: how many are known to be recorded, of a scan of an earlier life; the status
+        says so until the recording has been read.
 
         Raises:
             RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved.

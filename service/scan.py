@@ -9,7 +9,7 @@ power cut is the way after a pause.
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,7 +72,8 @@ class ScanSession:
 
     `report(kind, fields)` is told of everything that happens, from the session's thread;
     `recorded(index)` that a view is safe on disk; `conclude_with(state, detail)` is called before
-    the scan is said to have ended, and when nothing moves any more.
+    the scan is said to have ended, and when nothing moves any more. views_before: recorded by
+    earlier sessions as far as is known; told until the recording has been read.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class ScanSession:
         report: Report,
         recorded: Callable[[int], None],
         conclude_with: Callable[[ScanState, str], None] = lambda state, detail: None,
+        views_before: int = 0,
     ) -> None:
         self.path = path
         self._spec = spec
@@ -95,6 +97,7 @@ class ScanSession:
         self._state = ScanState.RUNNING
         self._detail = ""
         self._done: set[int] = set()
+        self._views_done = views_before
         self._lock = threading.Lock()
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name=f"scan-{spec.scan_id}", daemon=True)
@@ -121,7 +124,7 @@ class ScanSession:
                 scan_id=self._spec.scan_id,
                 tree_id=self._spec.tree_id,
                 state=self._state,
-                views_done=len(self._done),
+                views_done=self._views_done,
                 views_total=len(self._spec.waypoints),
                 detail=self._detail,
             )
@@ -171,9 +174,7 @@ class ScanSession:
     def _scan(self) -> None:
         if self.path.exists():  # whole, but the service ended before it could say so
             views = (view for view in read_recording(self.path).views() if isinstance(view, View))
-            self._done.update(view.index for view in views)
-            for index in sorted(self._done):
-                self._recorded(index)
+            self._take_over(view.index for view in views)
         else:
             self._record()
         self._end(ScanState.DONE, "")
@@ -186,10 +187,9 @@ class ScanSession:
             self.path, metadata, tool_from_camera=self._tools.tool_from_camera
         ) as writer:
             if source is not None:
-                self._done.update(carry_over(source, writer))
+                indices = carry_over(source, writer)
                 source.unlink()
-                for index in sorted(self._done):
-                    self._recorded(index)
+                self._take_over(indices)
             self._note(writer, "running", views_done=len(self._done))
             try:
                 self._visit_all(writer)
@@ -199,6 +199,16 @@ class ScanSession:
             for name, content in self._tools.attachments().items():
                 writer.attach(name, "application/json", content)
             writer.write_event(time.time_ns(), {"kind": "done", "views_done": len(self._done)})
+
+    def _take_over(self, indices: Iterable[int]) -> None:
+        self._count(*indices)
+        for index in sorted(self._done):
+            self._recorded(index)
+
+    def _count(self, *indices: int) -> None:
+        with self._lock:
+            self._done.update(indices)
+            self._views_done = len(self._done)
 
     def _visit_all(self, writer: RecordingWriter) -> None:
         stage = self._tools.stage
@@ -210,8 +220,7 @@ class ScanSession:
             view = self._capture(index, state, writer)
             with stage("record"):
                 writer.write_view(view)
-            with self._lock:
-                self._done.add(index)
+            self._count(index)
             with stage("bus"):
                 self._recorded(index)
             with stage("journal"):

@@ -162,7 +162,7 @@ class Scans:
         """
 
         def again(record: ScanRecord) -> ScanStatus:
-            return self._rig.start(spec_from(record.scan_id, record.request))
+            return self._rig.start(spec_from(record.scan_id, record.request), record.views_done)
 
         return self._command(scan_id, self._rig.resume, again)
 

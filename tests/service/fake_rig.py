@@ -78,7 +78,7 @@ class FakeRig:
             verdicts.append(WaypointVerdict(index=i, reachable=not far, reason=reason))
         return verdicts
 
-    def start(self, spec: ScanSpec) -> ScanStatus:
+    def start(self, spec: ScanSpec, views_before: int = 0) -> ScanStatus:
         with self._lock:
             self._refuse(spec)
             self.specs.append(spec)
@@ -86,7 +86,7 @@ class FakeRig:
                 scan_id=spec.scan_id,
                 tree_id=spec.tree_id,
                 state=ScanState.RUNNING,
-                views_done=0,
+                views_done=views_before,
                 views_total=len(spec.waypoints),
             )
         self.tell(spec.scan_id, "started")

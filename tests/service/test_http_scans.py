@@ -386,6 +386,7 @@ def test_a_scan_of_an_earlier_life_waits_for_an_operator_and_goes_on(tmp_path):
     with serving(tmp_path) as live:
         scan_id = live.start("k1", speed_mps=0.125)
         [first] = live.rig.specs
+        live.rig.photograph(scan_id, 0)
     with serving(tmp_path, FakeRig()) as live:
         scan = live.http.get(f"/v1/scans/{scan_id}").json()
         assert scan["state"] == "stopped"
@@ -394,7 +395,7 @@ def test_a_scan_of_an_earlier_life_waits_for_an_operator_and_goes_on(tmp_path):
         problem(live.http.post(f"/v1/scans/{scan_id}:resume"), 503, "rig_not_ready")
         live.rig.refusal = None
         answer = live.http.post(f"/v1/scans/{scan_id}:resume")
-        assert answer.json()["state"] == "running"
+        assert (answer.json()["state"], answer.json()["views_done"]) == ("running", 1)
         [spec] = live.rig.specs
         assert (spec.scan_id, spec.speed_mps) == (first.scan_id, first.speed_mps)
         assert all((a == b).all() for a, b in zip(spec.waypoints, first.waypoints, strict=True))

@@ -11,7 +11,7 @@ from scenes.wood import view_from
 
 from canopy_skel.geometry import invert
 from canopy_skel.pipeline import MethodConfig
-from canopy_skel.recording import read_recording
+from canopy_skel.recording import carry_over, read_recording
 from drivers import kinematics
 from drivers.errors import CameraTimeoutError
 from drivers.guarded_arm import GuardedArm, Limits
@@ -413,6 +413,31 @@ def test_what_a_killed_service_left_is_carried_on(rig):
     after = {v.index: v.depth_m.tobytes() for v in views_of(rig, "scan-1")}
     assert set(after) == {0, 1, 2, 3}
     assert all(after[index] == data for index, data in before.items())
+
+
+def test_the_count_of_views_never_falls_while_a_scan_is_taken_up_again(rig, monkeypatch):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 2:
+        time.sleep(0.005)
+    before = rig.pause("scan-1").views_done
+    reading, read = threading.Event(), threading.Event()
+
+    def slowly(*arguments):
+        reading.set()
+        assert read.wait(5.0)
+        return carry_over(*arguments)
+
+    monkeypatch.setattr("service.scan.carry_over", slowly)
+    assert rig.resume("scan-1").views_done == before
+    assert reading.wait(5.0)
+    assert rig.status("scan-1").views_done == before
+    read.set()
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+
+
+def test_the_count_of_an_earlier_life_holds_until_the_recording_has_been_read(rig):
+    assert rig.start(spec(), views_before=3).views_done == 3
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
 
 
 def test_a_scan_whose_recording_is_whole_is_done_without_a_move(rig, fake):
