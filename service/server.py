@@ -1,13 +1,18 @@
 """Serve an app until a signal; open event streams do not hold the end up."""
 
+import errno
+import logging
+import socket
 from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
 
+from canopy_skel.errors import UsageError
 from service.app import end_streams
 
 _BACK_STOP_S = 1
+_log = logging.getLogger("uvicorn.error")  # the one that uvicorn sets up
 
 
 class Server(uvicorn.Server):
@@ -21,6 +26,14 @@ class Server(uvicorn.Server):
         super().__init__(config)
         self._canopy = app
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to serve; say where, which uvicorn does only of sockets of its own."""
+        await super().startup(sockets)
+        for bound in sockets or []:
+            host, port = bound.getsockname()[:2]
+            address = f"[{host}]:{port}" if bound.family is socket.AF_INET6 else f"{host}:{port}"
+            _log.info("Serving at http://%s (Press CTRL+C to quit)", address)
+
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to end; a second signal ends at once."""
         if self.should_exit:
@@ -29,13 +42,13 @@ class Server(uvicorn.Server):
         end_streams(self._canopy)
 
 
-def make_server(
-    app: FastAPI, *, host: str = "127.0.0.1", port: int = 8000, log_level: str = "info"
-) -> Server:
-    """Return a server for the app, to be run with `run()`; one process, since there is one arm."""
+def make_server(app: FastAPI, *, port: int = 8000, log_level: str = "info") -> Server:
+    """Return a server for the app, to be run with `run()`; one process, since there is one arm.
+
+    port: of 127.0.0.1, unless `run` is given sockets.
+    """
     config = uvicorn.Config(
         app,
-        host=host,
         port=port,
         log_level=log_level,
         access_log=False,
@@ -43,3 +56,22 @@ def make_server(
         server_header=False,
     )
     return Server(app, config)
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """Return a socket that listens, for `Server.run`: taken before a rig is started for it.
+
+    Who calls before the server runs is answered as soon as it does. port: 0 = any free one.
+
+    Raises:
+        UsageError: the address is taken, or none of this machine's.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        why = "it is taken" if error.errno == errno.EADDRINUSE else error.strerror
+        raise UsageError(
+            f"cannot listen at {host}, port {port}: {why}; end what listens there, or choose"
+            " another --host or --port"
+        ) from error

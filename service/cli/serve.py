@@ -52,14 +52,13 @@ def serve(
     from mock_hw.orchard.simulate import Options
     from service.compose import ServeOptions, composed
     from service.rig_file import read_rig_file
-    from service.server import make_server
+    from service.server import listening, make_server
 
     if sim == (robot is not None):
         raise UsageError("give either --sim or --robot FILE, a rig file")
     rig_file = None if robot is None else read_rig_file(robot)
     access = _access(host, key_file, name or [])
     require_writable(data)
-    compile_kernels((*METHODS, *SEGMENTERS))
     options = ServeOptions(
         data=data,
         robot=rig_file,
@@ -71,8 +70,10 @@ def serve(
         bus=bus,
         access=access,
     )
-    with composed(options) as service:
-        make_server(service, host=host, port=port).run()
+    with listening(host, port) as bound:
+        compile_kernels((*METHODS, *SEGMENTERS))
+        with composed(options) as service:
+            make_server(service).run(sockets=[bound])
 
 
 def _access(host: str, key_file: Path | None, names: list[str]) -> "Access":

@@ -19,11 +19,11 @@ from fake_rig import FakeRig
 from live_service import PATHS
 from service.app import create_app
 from service.catalogue import Catalogue
-from service.server import make_server
+from service.server import listening, make_server
 
 with Catalogue(sys.argv[1]) as catalogue:
-    server = make_server(create_app(FakeRig(), catalogue, PATHS), port=0)
-    server.run()
+    server = make_server(create_app(FakeRig(), catalogue, PATHS))
+    server.run(sockets=[listening("127.0.0.1", 0)])
 print("cleaned up", flush=True)
 """
 
