@@ -33,6 +33,11 @@ class RecoverReport:
     bytes_lost: int
     damage: tuple[str, ...]
 
+    @property
+    def complete(self) -> bool:
+        """Whether the target holds all that was in the source."""
+        return not (self.views_incomplete or self.bytes_lost or self.damage)
+
 
 def recover(
     source: str | Path, target: str | Path, topics: TopicOptions | None = None

@@ -17,7 +17,7 @@ def recover(
     target: Annotated[Path, typer.Argument(help="Where the whole one goes.")],
     as_json: AsJson = False,
 ) -> None:
-    """Rewrite a truncated recording with all that is whole in it."""
+    """Rewrite a truncated recording with all that is whole in it; exit code 3 if it lacks some."""
     report = recover_recording(source, target)
     if as_json:
         typer.echo(json.dumps(_jsonable(report), indent=2))
@@ -29,7 +29,7 @@ def recover(
         stderr.print(f"warning: {source}: of view {index} only a part is left", style="yellow")
     for line in report.damage:
         stderr.print(f"warning: {line}", style="yellow", markup=False)
-    if report.damage:
+    if not report.complete:
         raise typer.Exit(Exit.PARTIAL)
 
 

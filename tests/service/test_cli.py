@@ -305,12 +305,18 @@ def test_a_truncated_recording_is_used_as_far_as_it_goes_and_can_be_recovered(
     assert 0 < used < 3
     whole = tmp_path / "whole.mcap"
     code, stdout, _ = canopy("recover", cut, whole, "--json")
-    assert code == 0
+    assert code == 3
     assert json.loads(stdout)["views_saved"] == used
     canopy("replay", whole, "-o", tmp_path / "out")
     one = from_json((tmp_path / "out" / "cut.skeleton.json").read_bytes())
     other = from_json((tmp_path / "out" / "whole.skeleton.json").read_bytes())
     np.testing.assert_array_equal(one.position, other.position)
+
+
+def test_recovering_what_lacks_nothing_is_no_partial_success(canopy, recording, tmp_path):
+    whole = tmp_path / "whole.mcap"
+    assert canopy("recover", recording, whole)[0] == 0
+    assert whole.stat().st_size > 0
 
 
 def test_inspect_says_what_is_there(canopy, recording):
