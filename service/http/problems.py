@@ -135,21 +135,20 @@ def _invalid(request: Request, error: Exception) -> JSONResponse:
         {"where": ".".join(str(part) for part in one["loc"]), "what": one["msg"]}
         for one in error.errors()
     ]
+    return answer(request, _invalid_request(errors))
+
+
+def _invalid_request(errors: list[dict[str, str]]) -> Problem:
     detail = "; ".join(f"{one['where']}: {one['what']}" for one in errors[:3])
-    return answer(
-        request,
-        Problem(
-            422,
-            "invalid_request",
-            "The request is not valid",
-            detail,
-            more={"errors": errors[:100]},
-        ),
-    )
+    title = "The request is not valid"
+    return Problem(422, "invalid_request", title, detail, more={"errors": errors[:100]})
 
 
 def _of_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)  # noqa: S101  # registered for nothing else
+    if error.status_code == HTTPStatus.BAD_REQUEST and error.__cause__ is not None:
+        # A body that could not even be parsed: not UTF-8, nested too deeply, digits without end.
+        return answer(request, _invalid_request([{"where": "body", "what": str(error.__cause__)}]))
     title = HTTPStatus(error.status_code).phrase
     detail = f"{request.method} {request.url.path}: {error.detail}; see /openapi.json"
     code = re.sub(r"\W+", "_", title.lower())

@@ -56,6 +56,8 @@ def list_scans(
     here: Here, limit: Annotated[int, Query(ge=1, le=200)] = 50, before: str | None = None
 ) -> dict[str, Any]:
     """List scans, newest first; `next` continues the list as `before`."""
+    if before is not None:
+        here.scans.record(before)  # an unknown one is a mistake, not the end of the list
     records = here.scans.catalogue.scans(limit, before)
     more = records[-1].scan_id if len(records) == limit else None
     return {"scans": [_fields(here, record) for record in records], "next": more}

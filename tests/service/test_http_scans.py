@@ -78,10 +78,23 @@ def test_numbers_that_are_none_are_refused(idle, number):
     problem(idle.http.post("/v1/scans", content=content, headers=headers), 422, "invalid_request")
 
 
-def test_bytes_that_are_no_json_are_refused(idle):
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"{not json",
+        b'{"tree_id": "\xff"}',
+        b"\xff\xfe{",
+        b"[" * 100_000,
+        b'{"tree_id": ' + b"1" * 5000 + b"}",
+    ],
+    ids=["no JSON", "not UTF-8", "not UTF-16", "too deep", "too many digits"],
+)
+def test_bytes_that_are_no_json_are_refused(idle, content):
     headers = {"Idempotency-Key": "k", "Content-Type": "application/json"}
-    answer = idle.http.post("/v1/scans", content=b"{not json", headers=headers)
-    problem(answer, 422, "invalid_request")
+    answer = idle.http.post("/v1/scans", content=content, headers=headers)
+    body = problem(answer, 422, "invalid_request")
+    assert body["errors"][0]["where"].startswith("body")
+    assert body["errors"][0]["what"]
 
 
 def test_a_huge_body_is_refused(idle):
@@ -372,6 +385,12 @@ def test_scans_are_listed_newest_first_page_by_page(live):
         if before is None:
             break
     assert listed == started[::-1]
+
+
+@pytest.mark.parametrize("before", ["nonesuch", ""])
+def test_a_list_before_an_unknown_scan_is_refused(idle, before):
+    answer = idle.http.get("/v1/scans", params={"before": before})
+    assert repr(before) in problem(answer, 404, "unknown_scan")["detail"]
 
 
 def test_a_repeated_start_after_a_crash_moves_nothing(tmp_path):
