@@ -1,9 +1,11 @@
 """Single pictures out of recordings, also out of those that still grow."""
 
 import os
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from threading import Lock
+from typing import BinaryIO
 
 import cv2
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -85,6 +87,16 @@ def recorded_file(path: Path | None) -> Path | None:
     whole = path.with_name(path.name.removesuffix(".part"))
     part = whole.with_name(f"{whole.name}.part")
     return next((file for file in (whole, part) if os.access(file, os.R_OK)), None)
+
+
+def open_recorded(path: Path | None) -> BinaryIO | None:
+    """Open a recording where it lies now, None if it does not; the caller closes it."""
+    for _ in range(2):  # it gets its final name when it is whole, perhaps between look and open
+        file = recorded_file(path)
+        if file is not None:
+            with suppress(FileNotFoundError):
+                return file.open("rb")
+    return None
 
 
 def _color_role(recording: Recording, index: int) -> str:

@@ -1,10 +1,12 @@
-"""Headers that negotiate: Accept, If-None-Match, Prefer (RFC 9110, RFC 7240)."""
+"""Headers that negotiate: Accept, If-None-Match, Range, Prefer (RFC 9110, RFC 7240)."""
 
 import re
 from collections.abc import Sequence
 
 LONGEST_WAIT_S = 60
 _WAIT = re.compile(r"(?:^|[,;])\s*wait\s*=\s*\"?(\d{1,6})\"?\s*(?=$|[,;])")
+
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 
 
 def best_media_type(accept: str, offered: Sequence[str]) -> str | None:
@@ -19,6 +21,20 @@ def matches(if_none_match: str, etag: str) -> bool:
     """Say whether one of the listed validators is `etag` (weak comparison)."""
     listed = [part.strip().removeprefix("W/") for part in if_none_match.split(",")]
     return "*" in listed or etag in listed
+
+
+def byte_range(asked: str, size: int) -> range | None:
+    """Return which of `size` bytes `Range` asks for, an empty range where they are not there.
+
+    None: all of them; so it is without the header, and with one of several ranges or of none.
+    """
+    found = _RANGE.fullmatch(asked.replace(" ", ""))
+    if found is None or not (found[1] or found[2]):
+        return None
+    if not found[1]:
+        return range(max(0, size - int(found[2])), size)
+    first, last = int(found[1]), int(found[2] or size)
+    return range(first, min(last + 1, size)) if first <= last or not found[2] else None
 
 
 def wait_s(prefer: str) -> int:

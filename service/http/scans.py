@@ -7,16 +7,17 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.bell import wait_for_ring
 from service.catalogue import MOST_NUMBER, EventRecord, ScanRecord
 from service.http.access import COMMAND
 from service.http.context import Context, Here, KnownScan
+from service.http.files import file_response
 from service.http.problems import Problem
 from service.http.requests import ScanBody, scan_spec
-from service.pictures import NoPictureError, PictureKind, recorded_file
+from service.pictures import NoPictureError, PictureKind, open_recorded
 from service.rig import FINISHED
 from service.scans import status_fields
 
@@ -145,13 +146,16 @@ def _picture(here: Context, scan_id: str, index: int, kind: PictureKind) -> Resp
     return Response(picture, media_type=kind.value, headers=headers)
 
 
-@router.get("/{scan_id}/recording.mcap", response_class=FileResponse)
-def download_recording(scan_id: KnownScan, here: Here) -> FileResponse:
-    """Return the recording, ranges of it too; while a scan grows, what is on disk by now."""
-    path = recorded_file(here.scans.recording(scan_id))
-    if path is None:
+@router.get("/{scan_id}/recording.mcap", response_class=Response)
+def download_recording(
+    scan_id: KnownScan,
+    here: Here,
+    asked: Annotated[str, Header(alias="range")] = "",
+    if_range: Annotated[str, Header()] = "",
+) -> Response:
+    """Return the recording, or a range of it; while a scan grows, what is on disk by now."""
+    stream = open_recorded(here.scans.recording(scan_id))
+    if stream is None:
         raise Problem(404, "no_recording", "No recording", f"scan {scan_id} has no recording")
-    headers = {"Cache-Control": "no-cache"}
-    return FileResponse(
-        path, media_type="application/x-mcap", filename=f"{scan_id}.mcap", headers=headers
-    )
+    name = f"{scan_id}.mcap"
+    return file_response(stream, name, "application/x-mcap", asked=asked, if_range=if_range)

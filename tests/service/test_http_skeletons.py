@@ -1,13 +1,16 @@
 import hashlib
 import json
+import os
+import re
 import threading
 import time
 
 import cv2
+import httpx2
 import numpy as np
 import pytest
 from fake_rig import DEMO_RECORDING, FakeRig
-from live_service import serving, skeleton, wait_until
+from live_service import problem, serving, skeleton, wait_until
 
 from canopy_skel.document import from_json
 from canopy_skel.exports import FORMATS
@@ -210,6 +213,79 @@ def test_the_recording_can_be_downloaded_in_ranges(recorded):
     assert DEMO_RECORDING.read_bytes().startswith(answer.content)
     part = recorded.http.get(f"{recorded.base}/recording.mcap", headers={"Range": "bytes=8-15"})
     assert (part.status_code, part.content) == (206, answer.content[8:16])
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "expected"),
+    [
+        ("bytes=0-0", 206, slice(0, 1)),
+        ("bytes=100-", 206, slice(100, None)),
+        ("bytes=-7", 206, slice(-7, None)),
+        ("bytes=5-999999999999", 206, slice(5, None)),
+        ("bytes=9-5", 200, slice(None)),
+        ("bytes=-", 200, slice(None)),
+        ("bytes=0-1,4-5", 200, slice(None)),
+        ("pages=1-2", 200, slice(None)),
+    ],
+)
+def test_ranges_are_those_that_were_asked_for(recorded, asked, status, expected):
+    url = f"{recorded.base}/recording.mcap"
+    content = recorded.http.get(url).content
+    answer = recorded.http.get(url, headers={"Range": asked})
+    assert (answer.status_code, answer.content) == (status, content[expected])
+    if status == 206:
+        first, last, size = map(int, re.findall(r"\d+", answer.headers["content-range"]))
+        assert (content[first : last + 1], size) == (answer.content, len(content))
+
+
+@pytest.mark.parametrize("asked", ["bytes=999999999999-", "bytes=-0"])
+def test_a_range_that_is_not_there_is_a_problem(recorded, asked):
+    url = f"{recorded.base}/recording.mcap"
+    answer = recorded.http.get(url, headers={"Range": asked})
+    problem(answer, 416, "range_not_satisfiable")
+    assert answer.headers["content-range"] == f"bytes */{len(recorded.http.get(url).content)}"
+
+
+def test_a_range_of_a_recording_that_has_changed_is_not_given(recorded):
+    url = f"{recorded.base}/recording.mcap"
+    etag = recorded.http.get(url).headers["etag"]
+    for if_range, status in ((etag, 206), ('"another"', 200)):
+        headers = {"Range": "bytes=8-15", "If-Range": if_range}
+        assert recorded.http.get(url, headers=headers).status_code == status
+
+
+def test_a_recording_that_grows_during_the_download_comes_as_it_was(tmp_path):
+    part = tmp_path / "scan.mcap.part"
+    with part.open("wb") as stream:
+        stream.truncate(32 << 20)  # more than fits between server and client
+        stream.seek(0, os.SEEK_END)
+        stream.write(b"the end")
+    before = part.read_bytes()
+    with serving(tmp_path / "state", FakeRig(recording=part)) as live:
+        url = f"{live.url}/v1/scans/{live.start()}/recording.mcap"
+        with httpx2.stream("GET", url) as answer:
+            with part.open("ab") as stream:
+                stream.write(b"x" * 1000)
+            part.rename(tmp_path / "scan.mcap")
+            assert answer.read() == before
+
+
+def test_a_recording_that_is_finished_just_now_is_found(tmp_path, monkeypatch):
+    part, whole = tmp_path / "scan.mcap.part", tmp_path / "scan.mcap"
+    part.write_bytes(b"all of it")
+    access = os.access
+
+    def finished_after(path, mode):
+        found = access(path, mode)
+        if path == part and found:
+            part.rename(whole)
+        return found
+
+    with serving(tmp_path / "state", FakeRig(recording=part)) as live:
+        scan_id = live.start()
+        monkeypatch.setattr("service.pictures.os.access", finished_after)
+        answer = live.http.get(f"/v1/scans/{scan_id}/recording.mcap")
+        assert (answer.status_code, answer.content) == (200, b"all of it")
 
 
 def test_pictures_come_as_the_recording_grows(tmp_path):
