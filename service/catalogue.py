@@ -24,7 +24,7 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 from canopy_skel.errors import UsageError
 from service.outputs import require_writable
 from service.rig import FINISHED, ScanState, ScanStatus
-from service.tables import EVENTS, IDEMPOTENCY, REVISIONS, SCANS
+from service.tables import EVENTS, IDEMPOTENCY, REVISIONS, SCANS, STOPS
 
 KEY_LIFETIME_NS = 24 * 3600 * 10**9
 MOST_NUMBER = 2**63 - 1
@@ -145,6 +145,21 @@ class Catalogue:
         for file in set(self._blobs.iterdir()) - named:
             file.unlink()
         return list(left)
+
+    def add_stop(self) -> None:
+        """Note that an operator has stopped the arm."""
+        with self.transaction() as connection:
+            connection.execute(STOPS.insert().values(stopped_ns=time.time_ns()))
+
+    def last_stop(self) -> int:
+        """Return the number of the last stop that nobody has acknowledged, 0 if there is none."""
+        with self.transaction() as connection:
+            return connection.scalar(sa.select(sa.func.max(STOPS.c.seq))) or 0
+
+    def drop_stops(self, last: int) -> None:
+        """Forget the stops up to one: they were acknowledged."""
+        with self.transaction() as connection:
+            connection.execute(STOPS.delete().where(STOPS.c.seq <= last))
 
     def add_scan(
         self,

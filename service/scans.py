@@ -11,7 +11,7 @@ from threading import Lock, Thread
 from types import TracebackType
 from typing import Any, Self
 
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import OperationalError, SQLAlchemyError
 
 from service.bell import Bell
 from service.catalogue import Catalogue, ScanRecord
@@ -63,6 +63,8 @@ class Scans:
         for left in self.catalogue.unfinished():  # whoever acknowledged told a rig that is gone
             scan_id = left.status.scan_id
             self._rig.hold(f"scan {scan_id} was stopped before the service was started again")
+        if self.catalogue.last_stop():
+            self._rig.hold("the arm was stopped before the service was started again")
         self._rig.subscribe(self._events.put)
         self._journal.start()
         return self
@@ -149,6 +151,28 @@ class Scans:
         """Return the newest scan that can still go on, None if there is none."""
         unfinished = self.catalogue.unfinished()
         return self.status(unfinished[0].scan_id) if unfinished else None
+
+    def stop(self) -> None:
+        """Stop the arm, then note it: a service that is started again holds the arm.
+
+        That it cannot be noted is no error: the arm was stopped, whoever is waiting must know.
+        """
+        try:
+            self._rig.stop()
+        finally:
+            try:
+                self.catalogue.add_stop()
+            except SQLAlchemyError:
+                logger.exception("stop not noted")
+
+    def acknowledge(self, reason: str) -> None:
+        """Let the arm move again, and forget the stops until now. Raises RigNotReadyError."""
+        last = self.catalogue.last_stop()  # one during the acknowledgement wants its own
+        self._rig.acknowledge(reason)
+        try:
+            self.catalogue.drop_stops(last)
+        except SQLAlchemyError:
+            logger.exception("acknowledgement not noted")
 
     def pause(self, scan_id: str) -> ScanStatus:
         """Stop the arm and keep the scan. Raises UnknownScanError."""

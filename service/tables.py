@@ -48,3 +48,10 @@ IDEMPOTENCY = sa.Table(
     sa.Column("response", sa.JSON, nullable=False),
     sa.Column("created_ns", sa.BigInteger, nullable=False),
 )
+STOPS = sa.Table(
+    "stops",
+    METADATA,
+    sa.Column("seq", sa.Integer, primary_key=True),
+    sa.Column("stopped_ns", sa.BigInteger, nullable=False),
+    sqlite_autoincrement=True,  # no number twice: a later stop is not the one acknowledged
+)

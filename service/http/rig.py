@@ -53,14 +53,14 @@ def show_rig(here: Here) -> dict[str, Any]:
 @stop_router.post("/v1/rig:stop")
 async def stop(here: Here) -> dict[str, str]:
     """Stop the arm now; no condition, never queued, harmless when repeated."""
-    await asyncio.to_thread(here.rig.stop)  # not in the pool that other requests may fill
+    await asyncio.to_thread(here.scans.stop)  # not in the pool that other requests may fill
     return {"status": "stopped"}
 
 
 @router.post("/v1/rig:acknowledge", dependencies=COMMAND)
 def acknowledge(body: AcknowledgeBody, here: Here) -> dict[str, str]:
     """Let the arm move again after a stop: an operator has looked and says why it is safe."""
-    here.rig.acknowledge(body.reason)
+    here.scans.acknowledge(body.reason)
     return {"status": "acknowledged"}
 
 

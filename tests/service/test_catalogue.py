@@ -63,6 +63,21 @@ def test_an_old_catalogue_opens_again(tmp_path):
     assert (record.status, record.request) == (status(), {"a": [0.1]})
 
 
+def test_a_catalogue_of_an_earlier_version_is_brought_up_to_date(tmp_path):
+    with Catalogue(tmp_path) as catalogue, catalogue.transaction() as connection:
+        catalogue_at_first(connection)
+    with Catalogue(tmp_path) as catalogue:
+        assert catalogue.last_stop() == 0
+        catalogue.add_stop()
+        assert catalogue.last_stop() == 1
+
+
+def catalogue_at_first(connection):
+    """Undo what later versions have changed."""
+    connection.execute(sa.text("DROP TABLE stops"))
+    connection.execute(sa.text("UPDATE alembic_version SET version_num = '0001'"))
+
+
 def test_a_refused_scan_is_forgotten_with_its_key(catalogue):
     catalogue.add_scan(status(), {}, "k", "sha", {})
     catalogue.add_event("s1", "started", {})

@@ -296,6 +296,50 @@ def test_stop_and_acknowledge(live):
     assert "pendant" in problem(answer, 503, "rig_not_ready")["detail"]
 
 
+def test_a_stop_without_a_scan_outlives_the_service_until_it_is_acknowledged(tmp_path):
+    with serving(tmp_path) as live:
+        live.http.post("/v1/rig:stop")
+        live.http.post("/v1/rig:stop")
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.holds == ["the arm was stopped before the service was started again"]
+        live.rig.refusal = RigNotReadyError("still in protective stop")
+        problem(acknowledged(live), 503, "rig_not_ready")
+    with serving(tmp_path, FakeRig()) as live:
+        assert len(live.rig.holds) == 1
+        assert acknowledged(live).status_code == 200
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.holds == []
+
+
+def test_a_stop_during_an_acknowledgement_outlives_the_service(tmp_path, monkeypatch):
+    with serving(tmp_path) as live:
+        live.http.post("/v1/rig:stop")
+        acknowledge = live.rig.acknowledge
+
+        def stopped_meanwhile(reason):
+            acknowledge(reason)
+            httpx2.post(f"{live.url}/v1/rig:stop")
+
+        monkeypatch.setattr(live.rig, "acknowledge", stopped_meanwhile)
+        assert acknowledged(live).status_code == 200
+    with serving(tmp_path, FakeRig()) as live:
+        assert len(live.rig.holds) == 1
+
+
+def test_the_arm_is_stopped_even_if_that_cannot_be_noted(tmp_path):
+    with serving(tmp_path) as live:
+        with closing(sqlite3.connect(tmp_path / "catalogue.sqlite")) as other:
+            other.execute(
+                "CREATE TRIGGER full BEFORE INSERT ON stops BEGIN SELECT no_such_function(); END"
+            )
+        assert live.http.post("/v1/rig:stop").status_code == 200
+        assert live.rig.stops == 1
+
+
+def acknowledged(live):
+    return live.http.post("/v1/rig:acknowledge", json={"reason": "looked"})
+
+
 def test_stop_does_not_queue_behind_other_requests(live, monkeypatch):
     gate, waiting = threading.Event(), threading.Semaphore(0)
 
