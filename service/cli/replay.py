@@ -12,7 +12,16 @@ from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.exports import FORMATS
 from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
-from service.cli.shell import AsJson, Exit, Out, complain, progress_bars, stderr, topic_options
+from service.cli.shell import (
+    AsJson,
+    Exit,
+    Farthest,
+    Out,
+    complain,
+    progress_bars,
+    stderr,
+    topic_options,
+)
 from service.doctor import available_memory_bytes
 from service.kernels import compile_kernels
 from service.outputs import require_writable
@@ -39,9 +48,7 @@ def replay(
     fragments: Annotated[
         bool, typer.Option(help="Use small wood outside the masks (method canopy).")
     ] = True,
-    farthest: Annotated[
-        float, typer.Option(help="Wood farther from the camera (m) is another tree's.", min=0.31)
-    ] = FARTHEST_M,
+    farthest: Farthest = FARTHEST_M,
     rooted: Annotated[
         bool,
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),

@@ -9,7 +9,7 @@ import typer
 from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
 from service.access_keys import read_key
-from service.cli.shell import AsJson, Exit, Out, progress_bars, stderr
+from service.cli.shell import AsJson, Exit, Farthest, Out, progress_bars, stderr, within
 from service.outputs import require_writable, write_all
 from service.rig import ScanStatus
 from service.skeletons import SEGMENTERS
@@ -24,10 +24,11 @@ def scan(
         str | None,
         typer.Option(help=f"One of {', '.join(SEGMENTERS)}; without, what suits the camera."),
     ] = None,
-    voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
-    farthest: Annotated[
-        float, typer.Option(help="Wood farther from the camera (m) is another tree's.")
-    ] = FARTHEST_M,
+    voxel: Annotated[
+        float,
+        typer.Option(help="Voxel size of the map in metres.", callback=within(0.001, 0.05)),
+    ] = 0.005,
+    farthest: Farthest = FARTHEST_M,
     rooted: Annotated[
         bool,
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),

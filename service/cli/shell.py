@@ -1,5 +1,6 @@
 """What the verbs share: options, exit codes, progress and complaints on stderr."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
@@ -14,6 +15,28 @@ from canopy_skel.recording import TopicOptions
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+FARTHEST_RANGE_M = (0.31, 20.0)
+"""As over HTTP: from just beyond the nearest depth that is used."""
+
+
+def within(least: float, most: float) -> Callable[[float], float]:
+    """Return the check of an option; typer's own minimum and maximum let NaN pass."""
+
+    def check(value: float) -> float:
+        if not least <= value <= most:
+            raise typer.BadParameter(f"{value} is not in the range {least} to {most}")
+        return value
+
+    return check
+
+
+Farthest = Annotated[
+    float,
+    typer.Option(
+        help="Wood farther from the camera (m) is another tree's.",
+        callback=within(*FARTHEST_RANGE_M),
+    ),
+]
 Out = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
 
 WIDEST_RANGE = 100_000

@@ -12,7 +12,16 @@ from service.http.context import Context, Here, KnownScan
 from service.http.skeletons import no_skeleton_yet
 
 router = APIRouter(prefix="/v1/scans/{scan_id}/skeleton", tags=["skeletons"])
-Metres = Annotated[float, Query(allow_inf_nan=False, description="metres, in base")]
+_FARTHEST_POINT_M = 1e6
+Metres = Annotated[
+    float,
+    Query(
+        ge=-_FARTHEST_POINT_M,
+        le=_FARTHEST_POINT_M,
+        allow_inf_nan=False,
+        description="metres, in base",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -160,6 +160,23 @@ def test_wood_farther_than_asked_for_is_left_out(canopy, recording, tmp_path, me
     assert (code, "no branch was found in 9 instances" in stderr) == (3, True)
 
 
+@pytest.mark.parametrize("metres", ["inf", "nan", "0.3", "20.1", "-inf"])
+@pytest.mark.parametrize("verb", [["replay", "some.mcap"], ["scan", "--url", "http://127.0.0.1:1"]])
+def test_a_farthest_that_is_none_is_refused(canopy, tmp_path, verb, metres):
+    code, _, stderr = canopy(*verb, "-o", tmp_path, "--farthest", metres)
+    assert code == 2
+    assert "--farthest" in stderr
+    assert "range" in stderr
+
+
+@pytest.mark.parametrize("metres", ["inf", "nan", "0"])
+def test_a_voxel_size_that_is_none_is_refused_before_the_service_is_asked(canopy, tmp_path, metres):
+    url = "http://127.0.0.1:1"
+    code, _, stderr = canopy("scan", "--url", url, "-o", tmp_path, "--voxel", metres)
+    assert code == 2
+    assert "--voxel" in stderr
+
+
 def test_canopy_says_of_every_vertex_how_it_is_known(canopy, recording, tmp_path):
     assert canopy("replay", recording, "-o", tmp_path, "--method", "canopy", "--rooted")[0] == 0
     document = from_json((tmp_path / "sticks.skeleton.json").read_bytes())

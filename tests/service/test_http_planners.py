@@ -51,6 +51,13 @@ def test_without_a_skeleton_or_a_point_there_is_a_problem(live):
     problem(live.http.get("/v1/scans/none/skeleton/nearest?x=0&y=0&z=0"), 404, "unknown_scan")
 
 
+@pytest.mark.parametrize("x", ["1e308", "-1000001", "inf"])
+def test_a_point_that_is_nowhere_near_is_refused(pole, x):
+    body = problem(pole.http.get(f"{pole.path}/nearest?x={x}&y=0&z=0"), 422, "invalid_request")
+    assert body["errors"][0]["where"] == "query.x"
+    assert pole.http.get(f"{pole.path}/nearest?x=-1e6&y=1e6&z=0").json()["distance_m"] > 1e6
+
+
 @given(st.lists(st.tuples(COORDINATE, COORDINATE, COORDINATE), min_size=2, max_size=12), st.data())
 def test_no_point_of_the_centre_lines_is_nearer(vertices, data):
     count = len(vertices)
