@@ -163,7 +163,7 @@ def serving(data, options):
                 tool_from_camera=simulation.tool_from_camera,
                 limits=SIMULATED_LIMITS,
                 paths=SIMULATED_PATHS,
-                attachments=dict,
+                attachments=lambda _: {},
                 stage=watching[0],
             )
 

@@ -1,11 +1,13 @@
 """The only place that chooses between real hardware and simulation, and starts the processes."""
 
+import logging
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -32,8 +34,10 @@ from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
 from service.rig import PartStatus, ScanSpec
 from service.rig_file import WATCHDOG_HZ, RigFile
-from service.scan import Stage
+from service.scan import Attachments, Stage
 from service.supervisor import Supervised
+
+_log = logging.getLogger(__name__)
 
 SIMULATED_LIMITS = Limits(
     box_min_m=(-0.9, -0.9, -0.85),
@@ -81,7 +85,7 @@ class Hardware:
     tool_from_camera: FloatArray
     limits: Limits
     paths: Mapping[str, Sequence[FloatArray]]
-    attachments: Callable[[], Mapping[str, bytes]]
+    attachments: Attachments
     stage: Stage = lambda name: nullcontext()
     segmenter: str = "recorded"
 
@@ -187,8 +191,20 @@ def simulated(options: ServeOptions) -> Iterator[Hardware]:
             tool_from_camera=simulation.tool_from_camera,
             limits=SIMULATED_LIMITS,
             paths=SIMULATED_PATHS,
-            attachments=lambda: {GROUND_TRUTH: to_json(camera.truth())},
+            attachments=partial(truth_of, camera),
         )
+
+
+def truth_of(camera: SimCamera, exposed_ns: Collection[int] | None) -> dict[str, bytes]:
+    """Return the true skeleton and what these pictures show of it, as a file to attach.
+
+    Nothing where some pictures were taken before this process was started: the camera of that time
+    knew what they show, and a truth that did not count them would call seen wood hidden.
+    """
+    if exposed_ns is None:
+        _log.warning("no truth is attached: an earlier life of the service took some pictures")
+        return {}
+    return {GROUND_TRUTH: to_json(camera.truth(exposed_ns))}
 
 
 def simulated_arm(host: str) -> Arm:
@@ -207,7 +223,7 @@ def real(rig: RigFile) -> Iterator[Hardware]:
         tool_from_camera=rig.camera.tool_from_camera.matrix(),
         limits=limits,
         paths=rig.waypoints(),
-        attachments=lambda: {"rig.json": rig.model_dump_json(indent=1).encode()},
+        attachments=lambda exposed_ns: {"rig.json": rig.model_dump_json(indent=1).encode()},
         segmenter="unet",
     )
 

@@ -28,7 +28,7 @@ from service.rig import (
     UnknownScanError,
     WaypointVerdict,
 )
-from service.scan import ScanSession, ScanTools, Stage
+from service.scan import Attachments, ScanSession, ScanTools, Stage
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class RigParts:
     tool_from_camera: FloatArray
     feed: Feed
     data: Path
-    attachments: Callable[[], Mapping[str, bytes]] = dict
+    attachments: Attachments = lambda exposed_ns: {}
     stage: Stage = lambda name: nullcontext()
 
 
@@ -251,9 +251,9 @@ class LocalRig:
 
         The session is there to be stopped before that is looked at: no stop falls in between.
         """
-        session = self._session_for(spec, views_before)
-        session.path.parent.mkdir(parents=True, exist_ok=True)
         before = self._sessions.get(spec.scan_id)
+        session = self._session_for(spec, views_before, before[1].exposed_ns if before else {})
+        session.path.parent.mkdir(parents=True, exist_ok=True)
         self._sessions[spec.scan_id] = (spec, session)
         try:
             if self._stops != stops:
@@ -269,7 +269,9 @@ class LocalRig:
             raise
         return session.status
 
-    def _session_for(self, spec: ScanSpec, views_before: int) -> ScanSession:
+    def _session_for(
+        self, spec: ScanSpec, views_before: int, exposed_before: Mapping[int, int]
+    ) -> ScanSession:
         parts = self._parts
         return ScanSession(
             spec,
@@ -286,6 +288,7 @@ class LocalRig:
             recorded=lambda index: parts.feed.offer(spec.scan_id, index),
             conclude_with=self._conclude,
             views_before=views_before,
+            exposed_before=exposed_before,
         )
 
     def _conclude(self, state: ScanState, detail: str) -> None:

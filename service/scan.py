@@ -9,10 +9,11 @@ power cut is the way after a pause.
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 from canopy_skel.errors import CanopyError
 from canopy_skel.frame import View
@@ -37,6 +38,9 @@ log = logging.getLogger(__name__)
 
 Report = Callable[[str, dict[str, object]], None]
 Stage = Callable[[str], AbstractContextManager[None]]
+Attachments = Callable[[Collection[int] | None], Mapping[str, bytes]]
+"""Files that go with a finished recording, by name, from when its pictures were exposed (ns of the
+host's monotonic clock); None where an earlier life of the service took some of them."""
 
 SLOWED_DOWN = 2.0
 """Times the planned duration that a move may take: the pendant's slider slows moves down."""
@@ -54,8 +58,8 @@ class PictureRefusedError(Exception):
 class ScanTools:
     """What a scan works with.
 
-    tool_from_camera: (4, 4), the hand-eye calibration. attachments: files that go with the finished
-    recording, by name; of a simulation the truth. stage: entered around each step, by its name.
+    tool_from_camera: (4, 4), the hand-eye calibration. stage: entered around each step, by its
+    name.
     """
 
     arm: Arm
@@ -63,7 +67,7 @@ class ScanTools:
     limits: Limits
     tool_from_camera: FloatArray
     quality: QualityLimits = field(default_factory=QualityLimits)
-    attachments: Callable[[], Mapping[str, bytes]] = dict
+    attachments: Attachments = lambda exposed_ns: {}
     stage: Stage = lambda name: nullcontext()
 
 
@@ -73,7 +77,8 @@ class ScanSession:
     `report(kind, fields)` is told of everything that happens, from the session's thread;
     `recorded(index)` that a view is safe on disk; `conclude_with(state, detail)` is called before
     the scan is said to have ended, and when nothing moves any more. views_before: recorded by
-    earlier sessions as far as is known; told until the recording has been read.
+    earlier sessions as far as is known; told until the recording has been read. exposed_before:
+    when the pictures of those were exposed, by view, as far as is known.
     """
 
     def __init__(
@@ -86,6 +91,7 @@ class ScanSession:
         recorded: Callable[[int], None],
         conclude_with: Callable[[ScanState, str], None] = lambda state, detail: None,
         views_before: int = 0,
+        exposed_before: Mapping[int, int] = MappingProxyType({}),
     ) -> None:
         self.path = path
         self._spec = spec
@@ -98,6 +104,7 @@ class ScanSession:
         self._detail = ""
         self._done: set[int] = set()
         self._views_done = views_before
+        self._exposed_ns = dict(exposed_before)
         self._lock = threading.Lock()
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name=f"scan-{spec.scan_id}", daemon=True)
@@ -115,6 +122,11 @@ class ScanSession:
     def running(self) -> bool:
         """Whether it has not ended; known at once, also while a move is being begun."""
         return self._state is ScanState.RUNNING
+
+    @property
+    def exposed_ns(self) -> Mapping[int, int]:
+        """When the picture of each view was exposed, as far as this process knows."""
+        return dict(self._exposed_ns)
 
     @property
     def status(self) -> ScanStatus:
@@ -196,9 +208,13 @@ class ScanSession:
             except (DriverError, PictureRefusedError, ScanInterruptedError) as error:
                 self._note(writer, "interrupted", reason=str(error))
                 raise
-            for name, content in self._tools.attachments().items():
+            for name, content in self._attachments().items():
                 writer.attach(name, "application/json", content)
             writer.write_event(time.time_ns(), {"kind": "done", "views_done": len(self._done)})
+
+    def _attachments(self) -> Mapping[str, bytes]:
+        exposed_ns = [self._exposed_ns[index] for index in self._done if index in self._exposed_ns]
+        return self._tools.attachments(exposed_ns if len(exposed_ns) == len(self._done) else None)
 
     def _take_over(self, indices: Iterable[int]) -> None:
         self._count(*indices)
@@ -260,6 +276,7 @@ class ScanSession:
                 )
                 reasons = [*flaws(image, self._tools.quality), *([shift] if shift else [])]
             if not reasons:
+                self._exposed_ns[index] = image.stamp_ns
                 return self._view(index, image, after)
             self._note(writer, "retake", index=index, attempt=attempt, reasons=reasons)
             before = after

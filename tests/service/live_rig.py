@@ -8,15 +8,14 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import httpx2
 from scipy.spatial.transform import Rotation
 
-from canopy_skel.document import to_json
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import read_recording
-from canopy_skel.recording.reader import GROUND_TRUTH
 from drivers.guarded_arm import GuardedArm
 from drivers.ur5.arm import Ur5Arm
 from drivers.ur5.messages import Ur5Config
@@ -31,6 +30,7 @@ from service.compose import (
     ServeOptions,
     composed,
     free_port,
+    truth_of,
 )
 from service.replay import ReplayRequest, replay
 from service.server import make_server
@@ -199,14 +199,16 @@ def hardware_at(host, camera=None):
     arm = GuardedArm(Ur5Arm(patient), SIMULATED_LIMITS)
     cell = {"arm": arm, "limits": SIMULATED_LIMITS, "paths": SIMULATED_PATHS}
     if camera is not None:
-        yield Hardware(camera=camera, tool_from_camera=TOOL_FROM_CAMERA, attachments=dict, **cell)
+        yield Hardware(
+            camera=camera, tool_from_camera=TOOL_FROM_CAMERA, attachments=lambda _: {}, **cell
+        )
         return
     simulation = prepare(ORCHARD)
     sim = SimCamera(lambda: arm.state().pose, simulation, scale=PICTURE_SCALE)
     yield Hardware(
         camera=sim,
         tool_from_camera=simulation.tool_from_camera,
-        attachments=lambda: {GROUND_TRUTH: to_json(sim.truth())},
+        attachments=partial(truth_of, sim),
         **cell,
     )
 

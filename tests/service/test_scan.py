@@ -1,5 +1,6 @@
 """Scans through the real ur-rtde client against the fake controller."""
 
+import json
 import re
 import threading
 import time
@@ -46,6 +47,7 @@ class StillCamera:
         self.spoiled = 0
         self.hangs = False
         self.grabs = 0
+        self.stamps_ns = []
 
     def __enter__(self):
         return self
@@ -64,8 +66,9 @@ class StillCamera:
         if self.spoiled > 0:
             self.spoiled -= 1
             color = np.full((240, 320, 3), 128, np.uint8)
+        self.stamps_ns.append(time.monotonic_ns())
         return CameraImage(
-            stamp_ns=time.monotonic_ns(),
+            stamp_ns=self.stamps_ns[-1],
             color_rgb=color,
             intrinsics=self.view.intrinsics,
             depth_m=self.view.depth_m,
@@ -127,6 +130,7 @@ def rig(fake, camera, tmp_path):
         tool_from_camera=TOOL_FROM_CAMERA,
         feed=Collected(),
         data=tmp_path,
+        attachments=lambda exposed_ns: {"exposed.json": json.dumps(exposed_ns).encode()},
     )
     with LocalRig(parts) as running:
         running.events = []
@@ -201,6 +205,40 @@ def test_a_paused_scan_stands_still_and_goes_on_where_it_was(rig, fake):
     assert sorted(path.name for path in rig.recording_path("scan-1").parent.iterdir()) == [
         "scan-1.mcap"
     ]
+
+
+def exposed_of(rig, scan_id):
+    return json.loads(read_recording(rig.recording_path(scan_id)).attachment("exposed.json"))
+
+
+def test_what_is_attached_is_of_the_pictures_in_the_recording_alone(rig, camera):
+    rig.start(spec())
+    wait_for(rig, "scan-1", ScanState.DONE)
+    camera.spoiled = 1
+    rig.start(spec("scan-2"))
+    while rig.status("scan-2").views_done < 2:
+        time.sleep(0.005)
+    rig.pause("scan-2")
+    rig.resume("scan-2")
+    wait_for(rig, "scan-2", ScanState.DONE)
+    assert exposed_of(rig, "scan-1") == camera.stamps_ns[:4]
+    kept = set(exposed_of(rig, "scan-2"))
+    assert len(kept) == 4
+    assert kept <= set(camera.stamps_ns[5:])  # the fifth was spoiled
+
+
+def test_pictures_of_an_earlier_life_are_said_not_to_be_known(rig, tmp_path):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    part = rig.recording_path("scan-1")
+    other = tmp_path / "scans" / "scan-2" / "scan-2.mcap.part"
+    other.parent.mkdir()
+    part.rename(other)  # as a service finds it that has just been started
+    rig.start(spec("scan-2"), views_before=1)
+    wait_for(rig, "scan-2", ScanState.DONE)
+    assert exposed_of(rig, "scan-2") is None
 
 
 def test_a_cancelled_scan_keeps_its_views_and_does_not_go_on(rig):
