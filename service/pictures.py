@@ -81,12 +81,15 @@ class Pictures:
 
 
 def recorded_file(path: Path | None) -> Path | None:
-    """Return where a recording lies now: under its name, or under `.part` while it grows."""
+    """Return where a recording lies now: under its name, or under `.part` while it grows.
+
+    While a scan that goes on copies what was set aside (`service.scan`), the copy lacks some.
+    """
     if path is None:
         return None
     whole = path.with_name(path.name.removesuffix(".part"))
-    part = whole.with_name(f"{whole.name}.part")
-    return next((file for file in (whole, part) if os.access(file, os.R_OK)), None)
+    growing = (whole.with_name(f"{whole.name}.{suffix}") for suffix in ("aside", "part"))
+    return next((file for file in (whole, *growing) if os.access(file, os.R_OK)), None)
 
 
 def open_recorded(path: Path | None) -> BinaryIO | None:

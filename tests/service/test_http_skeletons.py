@@ -288,6 +288,20 @@ def test_a_recording_that_is_finished_just_now_is_found(tmp_path, monkeypatch):
         assert (answer.status_code, answer.content) == (200, b"all of it")
 
 
+def test_what_was_recorded_is_there_while_a_scan_that_goes_on_copies_it(tmp_path):
+    copy = tmp_path / "scan.mcap.part"
+    content = DEMO_RECORDING.read_bytes()
+    copy.write_bytes(content)
+    with serving(tmp_path / "state", FakeRig(recording=copy)) as live:
+        base = f"/v1/scans/{live.start()}"
+        picture = live.http.get(f"{base}/views/0/color.jpg").content
+        copy.rename(tmp_path / "scan.mcap.aside")
+        for copied in (b"", content[:1000]):
+            assert live.http.get(f"{base}/views/0/color.jpg").content == picture
+            assert live.http.get(f"{base}/recording.mcap").content == content
+            copy.write_bytes(copied)
+
+
 def test_pictures_come_as_the_recording_grows(tmp_path):
     part = tmp_path / "scan.mcap.part"
     with serving(tmp_path / "state", FakeRig(recording=tmp_path / "scan.mcap")) as live:
