@@ -13,6 +13,9 @@ from drivers.guarded_arm import Limits, check, check_posture
 from drivers.protocols import ArmMode, ArmState, JointMove, LinearMove, Move, ToolPose
 
 JOINT_SPEEDS_RPS = (0.8, 0.4, 0.2, 0.1)
+"""Of the leading joint, where the flange may go at USUAL_SPEED_MPS; in proportion where less was
+asked for."""
+USUAL_SPEED_MPS = 0.25
 
 
 READY_JOINTS_RAD = np.array([np.pi, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0])
@@ -29,6 +32,8 @@ def moves_to(
 ) -> tuple[Move, ...]:
     """Return the moves from `state` to a pose: one if possible, else two by way of readiness.
 
+    None moves flange or tool faster than asked, through the joints neither.
+
     Raises:
         MoveRefusedError: there is no allowed way; the reason is that of the direct one.
     """
@@ -36,7 +41,7 @@ def moves_to(
     try:
         return (move_to(state, base_from_tool0, limits, **speeds),)
     except MoveRefusedError as refusal:
-        ready = _turn(state, [READY_JOINTS_RAD], limits)
+        ready = _turn(state, [READY_JOINTS_RAD], limits, speed_mps)
         if ready is None:
             raise
         try:
@@ -65,17 +70,21 @@ def move_to(
     try:
         check(straight, state, limits)
     except MoveRefusedError as refusal:
-        return _turn_to(state, base_from_tool0, limits, refusal)
+        return _turn_to(state, base_from_tool0, limits, speed_mps, refusal)
     return straight
 
 
 def _turn_to(
-    state: ArmState, base_from_tool0: FloatArray, limits: Limits, refusal: MoveRefusedError
+    state: ArmState,
+    base_from_tool0: FloatArray,
+    limits: Limits,
+    speed_mps: float,
+    refusal: MoveRefusedError,
 ) -> Move:
     solutions = kinematics.inverses(base_from_tool0, state.joints_rad)
     if not solutions:
         raise UnreachableError(str(refusal))
-    move = _turn(state, solutions, limits)
+    move = _turn(state, solutions, limits, speed_mps)
     if move is None:
         raise _why_not_there(solutions, limits) or refusal
     return move
@@ -94,14 +103,19 @@ def _why_not_there(postures: list[FloatArray], limits: Limits) -> MoveRefusedErr
     return reasons[0]
 
 
-def _turn(state: ArmState, postures: list[FloatArray], limits: Limits) -> JointMove | None:
+def _turn(
+    state: ArmState, postures: list[FloatArray], limits: Limits, speed_mps: float
+) -> JointMove | None:
     """Return an allowed move to one of the postures: near ones first, slower ones last."""
-    for speed_rps, joints in product(JOINT_SPEEDS_RPS, postures):
+    slower = min(1.0, speed_mps / USUAL_SPEED_MPS)
+    asked = replace(limits, speed_mps=min(limits.speed_mps, speed_mps))
+    for usual_rps, joints in product(JOINT_SPEEDS_RPS, postures):
+        speed_rps = slower * usual_rps
         move = JointMove(
             joints_rad=joints, speed_rps=speed_rps, acceleration_rps2=min(1.0, 2 * speed_rps)
         )
         try:
-            check(move, state, limits)
+            check(move, state, asked)
         except MoveRefusedError:
             continue
         return move

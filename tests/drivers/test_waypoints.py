@@ -2,10 +2,13 @@ import numpy as np
 import pytest
 from contracts.arm import down, joint, linear
 
+from canopy_skel.geometry import invert
 from drivers import kinematics
-from drivers.protocols import ArmMode, ArmState, ToolPose
-from drivers.waypoints import READY_JOINTS_RAD, travel_s
+from drivers.guarded_arm import Limits
+from drivers.protocols import ArmMode, ArmState, JointMove, ToolPose
+from drivers.waypoints import READY_JOINTS_RAD, after, moves_to, travel_s
 from mock_hw.fake_ur.motion import JointWay, LineWay, Motion
+from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
 
 STANDING = ArmState(
     pose=ToolPose(stamp_ns=0, base_from_tool0=kinematics.forward(READY_JOINTS_RAD)),
@@ -58,3 +61,25 @@ def duration_s(motion):
         motion.advance(0.008)
         steps += 1
     return 0.008 * steps
+
+
+@pytest.mark.parametrize("speed_mps", [0.25, 0.1, 0.02, 0.005])
+def test_a_move_through_the_joints_is_no_faster_than_asked(speed_mps):
+    limits = Limits(box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1))
+    state, through_the_joints = STANDING, 0
+    for base_from_camera in camera_path(70)[::9]:
+        pose = base_from_camera @ invert(TOOL_FROM_CAMERA)
+        for move in moves_to(state, pose, limits, speed_mps=speed_mps, acceleration_mps2=0.5):
+            if isinstance(move, JointMove):
+                through_the_joints += 1
+                assert fastest_mps(state, move) <= 1.001 * speed_mps
+            state = after(state, move)
+    assert through_the_joints
+
+
+def fastest_mps(state, move):
+    """How fast the flange gets while the leading joint turns at full speed."""
+    way = kinematics.turned_joints(state.joints_rad, move.joints_rad, 0.01)
+    places = np.array([kinematics.forward(joints)[:3, 3] for joints in way])
+    turn_rad = np.abs(np.diff(way, axis=0)).max(axis=1)
+    return (np.linalg.norm(np.diff(places, axis=0), axis=1) / turn_rad).max() * move.speed_rps
