@@ -29,6 +29,7 @@ from service.specs import fields_of, spec_from
 
 logger = logging.getLogger(__name__)
 _JOURNAL_TIMEOUT_S = 1.0
+_HOLDING = (ScanState.STOPPED, ScanState.FAILED)
 
 
 class KeyReusedError(Exception):
@@ -277,6 +278,8 @@ class Scans:
         if self.catalogue.scan(event.scan_id) is None:
             logger.info("event of no scan kind=%s fields=%s", event.kind, dict(event.fields))
             return
+        if event.kind in _HOLDING:  # noted apart from the scan, which may be cancelled by then
+            self.catalogue.add_stop()
         skeleton = self._rig.skeleton(event.scan_id)
         if skeleton is not None:
             self.catalogue.add_revision(event.scan_id, skeleton)

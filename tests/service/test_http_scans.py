@@ -8,7 +8,7 @@ import httpx2
 import numpy as np
 import pytest
 from fake_rig import FakeRig
-from live_service import BODY, PATHS, problem, serving
+from live_service import BODY, PATHS, problem, serving, wait_until
 
 from service.http.requests import SpeedCaps
 from service.rig import RigNotReadyError, ScanState
@@ -294,6 +294,21 @@ def test_stop_and_acknowledge(live):
     live.rig.refusal = RigNotReadyError("still in protective stop; unlock it on the pendant")
     answer = live.http.post("/v1/rig:acknowledge", json={"reason": "branch removed"})
     assert "pendant" in problem(answer, 503, "rig_not_ready")["detail"]
+
+
+@pytest.mark.parametrize("state", [ScanState.STOPPED, ScanState.FAILED])
+def test_a_scan_that_ended_badly_holds_the_arm_beyond_its_own_end_and_the_service(tmp_path, state):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        live.rig.become(scan_id, state=state, detail="something unheard of")
+        live.rig.tell(scan_id, state.value)
+        wait_until(lambda: live.http.get("/v1/scans").json()["scans"][0]["state"] == state)
+        live.http.post(f"/v1/scans/{scan_id}:cancel")
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.holds == ["the arm was stopped before the service was started again"]
+        live.http.post("/v1/rig:acknowledge", json={"reason": "looked"})
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.holds == []
 
 
 def test_a_stop_without_a_scan_outlives_the_service_until_it_is_acknowledged(tmp_path):
