@@ -28,10 +28,11 @@ from service.app import create_app
 from service.broadcast import Broadcast
 from service.bus import Keys, open_session
 from service.catalogue import Catalogue
-from service.feeder import ScanSource, ViewFeeder
+from service.feeder import ViewFeeder
 from service.http.access import Access
 from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
+from service.offered import ScanSource
 from service.rig import PartStatus, ScanSpec
 from service.rig_file import WATCHDOG_HZ, RigFile
 from service.scan import Attachments, Stage

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -13,66 +13,43 @@ import zenoh
 
 from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.messages import Message
-from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import Recording, messages_of_view, read_recording
 from service.bus import Keys
 from service.envelope import ViewEnvelope, encode_envelope
+from service.offered import Lacking, OfferedScan, OfferedView, ScanSource
 from service.rig import PartStatus
 from service.skeleton_cache import SkeletonCache
 from service.worker_watch import WorkerSeen, WorkerWatch
 
 IN_FLIGHT = 8
 """Views on their way at a time: what a worker's queue, and this process, hold at most."""
+EARLIER_IN_FLIGHT = 2
+"""The same of an earlier scan: one in work and one waiting, so that a view of the scan under way
+waits for no more than these."""
 STOP_TIMEOUT_S = 1.0
 _TICK_S = 0.1
-_PATIENCE_S = 1.0
-_MAX_PATIENCE_S = 16.0
+_ASK_AGAIN_S = 1.0
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ScanSource:
-    """A scan whose views are to be sent.
-
-    recording: returns where the recording is now (`.part` while it grows).
-    """
-
-    scan_id: str
-    config: MethodConfig
-    segmenter: str
-    recording: Callable[[], Path]
-
-
-@dataclass(kw_only=True, slots=True)
-class _Offered:
-    """A recorded view on its way to the worker.
-
-    messages: empty where the recording must be asked. sent_s: when it was sent, None = it is to be
-    sent, but not before due_s. tries: how often it was lost.
-    """
-
-    messages: tuple[Message, ...]
-    due_s: float = 0.0
-    sent_s: float | None = None
-    tries: int = 0
-
-    def patience_s(self) -> float:
-        """How long to wait before trying again."""
-        return min(_PATIENCE_S * 2.0**self.tries, _MAX_PATIENCE_S)
-
-
 class ViewFeeder:
-    """Sends the views of the scan under way to the workers of a rig until they have them.
+    """Sends the views of scans to the workers of a rig until they have them.
 
     A view is sent as it was recorded. It counts as there when a worker's heartbeat lists it, used
     or rejected; it is sent again, from the recording, to a worker that has started since, or that
     has nothing to do and does not have it. All sending and reading happens in a thread of its own.
+
+    The scan under way comes first: somebody waits beside its tree. Only while the workers have all
+    of it, and its skeleton is here, earlier scans are caught up on, one after the other: a worker
+    keeps two scans, so it drops neither when a view of the scan under way comes in between.
 
     Args:
         session: an open bus session.
         keys: of the rig.
         on_skeleton: called with scan id and document (JSON) when a newer one has come, from a
             thread of zenoh's; must return at once.
+        on_caught_up: called with scan id, number of views and the views that no worker took
+            when nothing more is sent of an earlier scan, from the feeder's thread.
     """
 
     def __init__(
@@ -80,11 +57,13 @@ class ViewFeeder:
         session: zenoh.Session,
         keys: Keys,
         on_skeleton: Callable[[str, bytes], None] = lambda scan_id, document: None,
+        on_caught_up: Callable[[str, int, Sequence[int]], None] = lambda *told: None,
     ) -> None:
         self._session, self._keys, self._on_skeleton = session, keys, on_skeleton
+        self._on_caught_up = on_caught_up
         self._changed = threading.Condition()
-        self._source: ScanSource | None = None
-        self._offered: dict[int, _Offered] = {}
+        self._current: OfferedScan | None = None
+        self._earlier: dict[str, OfferedScan] = {}  # in the order they are caught up on
         self._recording: Recording | None = None  # the thread's alone
         self._asked_s = 0.0
         self._stopping = False
@@ -110,19 +89,36 @@ class ViewFeeder:
         self._thread.join(STOP_TIMEOUT_S)
 
     def begin(self, source: ScanSource) -> None:
-        """Turn to a scan; views of the one before that are missing still are sent no more.
+        """Turn to a scan; views of the one before that are missing still are sent when it rests.
 
         Raises:
             UsageError: the scan id cannot be part of a bus key.
         """
         self._keys.view(source.scan_id)
-        self._skeletons.forget(source.scan_id)
         with self._changed:
-            self._source, self._offered = source, {}
+            self._put_back(but=source.scan_id)
+            self._skeletons.forget(source.scan_id)
+            self._earlier.pop(source.scan_id, None)
+            self._current = OfferedScan(source=source)
             self._changed.notify_all()
 
+    def catch_up(self, source: ScanSource) -> None:
+        """Have all views sent of a scan that has ended before; nothing if it is under way.
+
+        Which views it has is looked up when its turn comes, after the scan under way.
+
+        Raises:
+            UsageError: the scan id cannot be part of a bus key.
+        """
+        self._keys.view(source.scan_id)
+        with self._changed:
+            if self._current is None or self._current.source.scan_id != source.scan_id:
+                scan = OfferedScan(source=source, listed=False)
+                self._earlier.setdefault(source.scan_id, scan)
+                self._changed.notify_all()
+
     def offer(self, index: int, messages: Sequence[Message] = ()) -> None:
-        """Say that a view of the scan is in the recording; returns at once.
+        """Say that a view of the scan under way is in the recording; returns at once.
 
         Args:
             index: of the view.
@@ -132,15 +128,16 @@ class ViewFeeder:
             UsageError: no scan was begun.
         """
         with self._changed:
-            if self._source is None:
+            if self._current is None:
                 raise UsageError(f"view {index} is of no scan; begin one first")
-            held = sum(bool(one.messages) for one in self._offered.values())
+            views = self._current.views
+            held = sum(bool(one.messages) for one in views.values())
             kept = tuple(messages) if held < IN_FLIGHT else ()
-            self._offered.setdefault(index, _Offered(messages=kept))
+            views.setdefault(index, OfferedView(messages=kept))
             self._changed.notify_all()
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until every offered view has arrived and its skeleton is here; say whether so.
+        """Wait until the scan under way has arrived and its skeleton is here; say whether so.
 
         Without a worker there is nothing to wait for.
         """
@@ -173,20 +170,28 @@ class ViewFeeder:
         self._notify()
 
     def _complete(self) -> bool:
-        workers = self._watch.workers()
-        source = self._source
-        if source is None or not workers or any(one.heartbeat.busy for one in workers):
+        scan, workers = self._current, self._watch.workers()
+        if scan is None or not workers:
             return False
-        return not self._missing(source, workers) and not self._behind(workers)
+        beats = (one.heartbeat for one in workers)
+        if any(beat.busy and beat.scan_id == scan.source.scan_id for beat in beats):
+            return False
+        return not self._lacking(scan, workers) and not self._behind(workers)
 
-    def _missing(
-        self, source: ScanSource, workers: Sequence[WorkerSeen]
-    ) -> dict[int, list[WorkerSeen]]:
-        """Return by view the workers that lack it; views that all have are left out."""
-        sha256 = source.config.sha256()
-        has = [(worker, worker.has(source.scan_id, sha256)) for worker in workers]
-        lacking = {i: [one for one, views in has if i not in views] for i in self._offered}
-        return {index: workers for index, workers in lacking.items() if workers}
+    def _lacking(self, scan: OfferedScan, workers: Sequence[WorkerSeen]) -> Lacking:
+        return scan.lacking(workers, self._skeletons.version(scan.source.scan_id))
+
+    def _is_covered(self, scan: OfferedScan) -> bool:
+        return scan.covered_by(self._skeletons.version(scan.source.scan_id))
+
+    def _put_back(self, but: str) -> None:
+        """Have the scan under way caught up on later, unless it has all or goes on itself."""
+        scan = self._current
+        if scan is None or scan.source.scan_id == but or self._is_covered(scan):
+            return
+        for one in scan.views.values():
+            one.messages, one.tries = (), 0
+        self._earlier[scan.source.scan_id] = scan
 
     def _behind(self, workers: Sequence[WorkerSeen]) -> str | None:
         """Return a scan of whose skeleton an idle worker has a newer version."""
@@ -206,58 +211,79 @@ class ViewFeeder:
                 if self._stopping:
                     return
                 workers = self._watch.workers()
-                source, index = self._source, self._next(workers)
-                one = None if index is None else self._offered[index]
-                if one is None:
+                step = self._next(workers)
+                if step is None:
                     self._changed.wait(_TICK_S)
-            self._catch_up(workers)
-            if source is not None and index is not None and one is not None:
-                self._send(source, index, one)
+            self._fetch_missed(workers)
+            if step is not None:
+                step()
 
-    def _catch_up(self, workers: Sequence[WorkerSeen]) -> None:
+    def _fetch_missed(self, workers: Sequence[WorkerSeen]) -> None:
         """Ask for a skeleton that was missed, at most once in a while."""
         scan_id = self._behind(workers)
         now_s = time.monotonic()
-        if scan_id is not None and now_s - self._asked_s > _PATIENCE_S:
+        if scan_id is not None and now_s - self._asked_s > _ASK_AGAIN_S:
             self._asked_s = now_s
             self._skeletons.fetch(scan_id)
 
-    def _next(self, workers: Sequence[WorkerSeen]) -> int | None:
-        """Return the view to send now, if any."""
-        if self._source is None:
-            return None
+    def _next(self, workers: Sequence[WorkerSeen]) -> Callable[[], None] | None:
+        """Return what to do now, if anything."""
+        scan = self._current
         if not workers:
-            for one in self._offered.values():
-                one.messages = ()  # the recording has them
+            if scan is not None:
+                scan.release()
             return None
-        now_s = time.monotonic()
-        missing = self._missing(self._source, workers)
-        for index, lacking in missing.items():
-            self._mark_lost(self._offered[index], lacking)
-        on_their_way = sum(self._offered[index].sent_s is not None for index in missing)
-        if on_their_way >= IN_FLIGHT:
+        if scan is not None:
+            lacking = self._lacking(scan, workers)
+            index = scan.next_to_send(lacking, IN_FLIGHT)
+            if index is not None:
+                return partial(self._send, scan, index)
+            if not scan.is_over(lacking):
+                return None
+        return self._next_of_earlier(workers)
+
+    def _next_of_earlier(self, workers: Sequence[WorkerSeen]) -> Callable[[], None] | None:
+        """Return the next step of the first of the earlier scans, of the others when it is over."""
+        scan = next(iter(self._earlier.values()), None)
+        if scan is None:
             return None
-        due = (i for i in missing if self._is_due(self._offered[i], now_s))
-        return min(due, default=None)
+        if not scan.listed:
+            return partial(self._list, scan)
+        lacking = {} if self._is_covered(scan) else self._lacking(scan, workers)
+        if scan.is_over(lacking):
+            return partial(self._finish, scan, sorted(lacking))
+        index = scan.next_to_send(lacking, EARLIER_IN_FLIGHT)
+        return None if index is None else partial(self._send, scan, index)
 
-    @staticmethod
-    def _is_due(one: _Offered, now_s: float) -> bool:
-        return one.sent_s is None and one.due_s <= now_s
+    def _list(self, scan: OfferedScan) -> None:
+        """Look up which views a recording has; one that cannot be read has none."""
+        try:
+            self._recording = read_recording(scan.source.recording())
+            groups = self._recording.groups
+        except RecordingError as error:
+            _log.warning("scan %s: no view of it is sent: %s", scan.source.scan_id, error)
+            groups = ()
+        with self._changed:
+            scan.views = {one.index: OfferedView() for one in groups if not one.partial}
+            scan.listed = True
 
-    @staticmethod
-    def _mark_lost(one: _Offered, lacking: Sequence[WorkerSeen]) -> None:
-        """Have a view sent again if a worker has started since, or idles without it."""
-        if one.sent_s is None:
-            return
-        for worker in lacking:
-            if worker.first_s > one.sent_s:
-                one.sent_s, one.tries = None, 0
-                return
-            if not worker.heartbeat.busy and worker.last_s - one.sent_s > one.patience_s():
-                one.sent_s, one.tries = None, one.tries + 1
-                return
+    def _finish(self, scan: OfferedScan, refused: Sequence[int]) -> None:
+        """Leave an earlier scan, and let the worker drop that one before the scan under way."""
+        scan_id = scan.source.scan_id
+        with self._changed:
+            if self._earlier.get(scan_id) is not scan:
+                return  # it goes on itself
+            del self._earlier[scan_id]
+            current = self._current
+            known = max(current.views, default=None) if current and self._earlier else None
+        if refused:
+            _log.warning("scan %s: no worker takes views %s; given up", scan_id, refused)
+        self._on_caught_up(scan_id, len(scan.views), refused)
+        if current is not None and known is not None:
+            self._send(current, known)  # a worker keeps the scans it heard of last
 
-    def _send(self, source: ScanSource, index: int, one: _Offered) -> None:
+    def _send(self, scan: OfferedScan, index: int) -> None:
+        source, one = scan.source, scan.views[index]
         try:
             envelope = ViewEnvelope(
                 scan_id=source.scan_id,
@@ -272,12 +298,12 @@ class ViewFeeder:
                 encode_envelope(envelope),
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
-            one.sent_s = time.monotonic()
         except (RecordingError, UsageError, zenoh.ZError) as error:
             _log.warning("scan %s: view %d is not sent yet: %s", source.scan_id, index, error)
             self._recording = None
-            one.due_s, one.tries = time.monotonic() + one.patience_s(), one.tries + 1
-        one.messages = ()
+            one.put_off()
+        else:
+            one.mark_sent()
 
     def _recorded(self, source: ScanSource, index: int) -> tuple[Message, ...]:
         """Read a view from the recording, which is looked through anew only if need be."""

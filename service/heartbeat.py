@@ -7,6 +7,8 @@ from canopy_skel.messages import encode_json
 from service.bus import BusError
 
 PERIOD_S = 0.5
+SCANS_KEPT = 2
+"""How many scans a worker keeps: those it worked on last."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -30,12 +30,11 @@ from canopy_skel.messages import encode_json
 from canopy_skel.pipeline import METHODS
 from service.bus import ENCODING_JSON, ENCODING_PROBLEM, Keys, open_session
 from service.envelope import ViewEnvelope, decode_envelope
-from service.heartbeat import PERIOD_S, Heartbeat, Version
+from service.heartbeat import PERIOD_S, SCANS_KEPT, Heartbeat, Version
 from service.kernels import compile_kernels
 from service.live import LiveSkeleton, warm_up
 from service.skeletons import SEGMENTERS
 
-SCANS_KEPT = 2
 _log = logging.getLogger(__name__)
 
 
@@ -167,12 +166,12 @@ class Worker:
         self._say()
 
     def _publish(self) -> None:
-        """Publish the skeleton of every scan that has grown since its last one.
+        """Publish the skeleton of every scan that has grown since its last one, the newest first.
 
         While views are waiting, at most half of the time goes into skeletons, and previews do.
         """
         start_s, exact = time.monotonic(), self._inbox.empty()
-        for scan_id, scan in self._scans.items():
+        for scan_id, scan in reversed(self._scans.items()):
             version = Version(revision=len(scan.views), rejected=len(scan.rejected), exact=exact)
             known, _ = self._documents.get(scan_id, (Version(), b""))
             data = scan.document(preview=not exact) if version.order > known.order else None

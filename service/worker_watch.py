@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import zenoh
 
 from service.bus import BusError, Keys
-from service.heartbeat import Heartbeat, decode_heartbeat
+from service.heartbeat import SCANS_KEPT, Heartbeat, decode_heartbeat
 from service.rig import PartStatus
 
 STALE_S = 2.0
@@ -21,20 +21,31 @@ _log = logging.getLogger(__name__)
 class WorkerSeen:
     """The last heartbeat of a worker process; times are of the monotonic clock.
 
+    scans: the last heartbeat on each of the scans it keeps, the one it worked on last at the end.
     first_s, last_s: its first and last heartbeat. moved_s: when it was idle or made progress last.
     """
 
     heartbeat: Heartbeat
+    scans: tuple[Heartbeat, ...]
     first_s: float
     last_s: float
     moved_s: float
 
     def has(self, scan_id: str, config_sha256: str) -> frozenset[int]:
         """Return the views of a scan that the worker has used or rejected."""
-        beat = self.heartbeat
-        if (beat.scan_id, beat.config_sha256) != (scan_id, config_sha256):
-            return frozenset()
-        return frozenset((*beat.views, *beat.rejected))
+        return frozenset(
+            view
+            for beat in self._on(scan_id, config_sha256)
+            for view in (*beat.views, *beat.rejected)
+        )
+
+    def has_usable(self, scan_id: str, config_sha256: str) -> bool:
+        """Return whether the worker has used a view of a scan."""
+        return any(beat.views for beat in self._on(scan_id, config_sha256))
+
+    def _on(self, scan_id: str, config_sha256: str) -> list[Heartbeat]:
+        wanted = (scan_id, config_sha256)
+        return [one for one in self.scans if (one.scan_id, one.config_sha256) == wanted]
 
 
 class WorkerWatch:
@@ -94,6 +105,7 @@ class WorkerWatch:
             moving = before is None or not beat.busy or beat.progress != before.heartbeat.progress
             self._last = self._seen[beat.id, beat.pid] = WorkerSeen(
                 heartbeat=beat,
+                scans=_kept(before.scans if before else (), beat),
                 first_s=now_s
                 if before is None or now_s - before.last_s > STALE_S
                 else before.first_s,
@@ -109,3 +121,10 @@ class WorkerWatch:
             with self._lock:
                 self._seen = {key: one for key, one in self._seen.items() if key[0] != worker_id}
             self._on_change()
+
+
+def _kept(before: tuple[Heartbeat, ...], beat: Heartbeat) -> tuple[Heartbeat, ...]:
+    """Return what a worker keeps, as it keeps it: the scans it worked on last."""
+    if not beat.scan_id:
+        return ()
+    return (*(one for one in before if one.scan_id != beat.scan_id), beat)[-SCANS_KEPT:]

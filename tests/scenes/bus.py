@@ -16,7 +16,8 @@ from scenes.wood import view_from
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter
 from service.bus import Keys, open_session
-from service.feeder import ScanSource, ViewFeeder
+from service.feeder import ViewFeeder
+from service.offered import ScanSource
 from service.replay import ReplayRequest, replay
 
 ROOT = Path(__file__).parents[2]
@@ -57,6 +58,7 @@ class Rig:
         self.folder = folder
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.documents = []
+        self.caught_up = []
         self._stack = ExitStack()
         self._workers = []
         self._numbers = count(1)
@@ -65,7 +67,10 @@ class Rig:
         self.session = self._stack.enter_context(open_session(listen=self.endpoint))
         self.feeder = self._stack.enter_context(
             ViewFeeder(
-                self._wrap(self.session), self.keys, lambda *found: self.documents.append(found)
+                self._wrap(self.session),
+                self.keys,
+                lambda *found: self.documents.append(found),
+                lambda *told: self.caught_up.append(told),
             )
         )
         return self
@@ -100,6 +105,12 @@ class Rig:
         """Begin a further scan and return the writer of its recording, not yet entered."""
         self.scan_id = name = f"scan-{next(self._numbers)}"
         self.documents.clear()
+        self.feeder.begin(self.source(name, **changes))
+        path = self.folder / f"{name}.mcap"
+        return RecordingWriter(path, {"scan_id": name}, tool_from_camera=np.eye(4))
+
+    def source(self, name, **changes):
+        """Return what a feeder must know of a scan."""
         path = self.folder / f"{name}.mcap"
         part = path.with_name(path.name + ".part")
         source = {
@@ -108,12 +119,11 @@ class Rig:
             "segmenter": "recorded",
             "recording": lambda: path if path.exists() else part,
         }
-        self.feeder.begin(ScanSource(**(source | changes)))
-        return RecordingWriter(path, {"scan_id": name}, tool_from_camera=np.eye(4))
+        return ScanSource(**(source | changes))
 
-    def replayed(self, config=None):
-        """Return the bytes that a replay of the last recording gives."""
-        name = self.scan_id
+    def replayed(self, config=None, name=None):
+        """Return the bytes that a replay of a recording gives, by default of the last."""
+        name = name or self.scan_id
         request = ReplayRequest(
             config=config or MethodConfig(),
             segmenter="recorded",

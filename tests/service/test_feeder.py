@@ -1,0 +1,153 @@
+"""Scans that the workers do not get while they are under way; what they do get: test_worker."""
+
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+from scenes.bus import Rig, scan_views, wait_for
+
+from service.bus import scan_id_of
+from service.envelope import decode_envelope
+from service.heartbeat import decode_version
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Ten views; the seventh cannot be used."""
+    return scan_views(unusable=(6,))
+
+
+@pytest.fixture
+def rig(tmp_path):
+    with Rig(tmp_path) as rig:
+        yield rig
+
+
+def record(rig, views, **changes):
+    """Scan: begin, write views and offer them; return the id."""
+    with rig.scan(**changes) as writer:
+        for view in views:
+            rig.feeder.offer(view.index, writer.write_view(view))
+    return rig.scan_id
+
+
+def wait_for_skeleton(rig, name, timeout_s=30):
+    replayed = rig.replayed(name=name)
+    wait_for(lambda: rig.feeder.latest_skeleton(name) == replayed, timeout_s)
+
+
+def test_scans_that_had_no_worker_are_caught_up_on_the_last_one_first(rig, views):
+    first = record(rig, views)
+    second = record(rig, views[:4])
+    last = record(rig, views[:6])
+    rig.start_ready_worker()
+    assert rig.feeder.flush(20)
+    assert {name for name, _ in rig.documents} == {last}
+    for name in (first, second):
+        wait_for_skeleton(rig, name)
+    wait_for(lambda: len(rig.caught_up) == 2)
+    assert rig.caught_up == [(first, 10, []), (second, 4, [])]
+
+
+def test_a_scan_that_is_left_before_the_worker_has_it_all_is_caught_up_on(rig, views):
+    rig.start_ready_worker()
+    first = record(rig, views)
+    second = record(rig, views[:1])
+    assert rig.feeder.flush(20)
+    for name in (first, second):
+        wait_for_skeleton(rig, name)
+
+
+def test_no_scan_is_begun_twice_when_a_scan_goes_on_while_others_are_caught_up_on(rig, views):
+    sent, revisions = Counter(), []
+
+    def count(sample):
+        envelope = decode_envelope(sample.payload.to_bytes())
+        sent[envelope.scan_id, envelope.view] += 1
+
+    def note(sample):
+        version = decode_version(sample.attachment.to_bytes())
+        revisions.append((scan_id_of(str(sample.key_expr)), version.revision))
+
+    listeners = [
+        rig.session.declare_subscriber(rig.keys.views, count),
+        rig.session.declare_subscriber(rig.keys.skeletons, note),
+    ]
+    earlier = [record(rig, views) for _ in range(3)]
+    with rig.scan() as writer:
+        rig.start_ready_worker()
+        for view in views:
+            rig.feeder.offer(view.index, writer.write_view(view))
+            assert rig.feeder.flush(20)
+            seen = len(revisions)
+            wait_for(lambda seen=seen: len(revisions) > seen or len(rig.caught_up) == 3)
+    for name in (*earlier, rig.scan_id):
+        wait_for_skeleton(rig, name)
+    wait_for(lambda: len(rig.caught_up) == 3)
+    for name in (*earlier, rig.scan_id):
+        assert all(a <= b for a, b in pairwise(n for scan_id, n in revisions if scan_id == name))
+    assert all(sent[name, view.index] == 1 for name in earlier for view in views)
+    # Beyond its own: one between two earlier scans, that the worker may not drop it.
+    assert sum(sent[rig.scan_id, view.index] for view in views) <= len(views) + 2
+    del listeners
+
+
+def test_a_worker_killed_while_it_catches_up_is_followed_by_one_that_does(rig, views):
+    first = record(rig, views)
+    last = record(rig, views[:3])
+    worker = rig.start_ready_worker()
+    wait_for(lambda: any(name == first for name, _ in rig.documents))
+    worker.kill()
+    wait_for(lambda: not rig.feeder.worker_status().ready, 5)
+    rig.start_ready_worker()
+    for name in (first, last):
+        wait_for_skeleton(rig, name)
+
+
+def test_a_scan_that_goes_on_again_is_no_earlier_one_any_more(rig, views):
+    first = record(rig, views)
+    record(rig, views[:2])
+    rig.feeder.begin(rig.source(first))
+    for view in views:
+        rig.feeder.offer(view.index)
+    rig.start_ready_worker()
+    assert rig.feeder.flush(20)
+    assert rig.feeder.latest_skeleton(first) == rig.replayed(name=first)
+    wait_for_skeleton(rig, rig.scan_id)
+    wait_for(lambda: rig.caught_up)
+    assert rig.caught_up == [(rig.scan_id, 2, [])]
+
+
+def test_recordings_of_an_earlier_service_are_fed_after_the_scan_under_way(tmp_path, views):
+    with Rig(tmp_path) as rig:
+        first, second = record(rig, views), record(rig, views[:5])
+    with Rig(tmp_path) as rig:
+        for name in (first, second):
+            rig.feeder.catch_up(rig.source(name))
+        rig.scan_id = "scan-of-now"
+        rig.feeder.begin(rig.source("scan-of-now", recording=rig.source(second).recording))
+        for view in views[:5]:
+            rig.feeder.offer(view.index)
+        rig.feeder.catch_up(rig.source("scan-of-now"))  # it is under way: nothing to do
+        rig.start_ready_worker()
+        assert rig.feeder.flush(20)
+        assert {name for name, _ in rig.documents} == {"scan-of-now"}
+        for name in (first, second):
+            wait_for_skeleton(rig, name)
+        wait_for(lambda: len(rig.caught_up) == 2)
+        assert rig.caught_up == [(first, 10, []), (second, 5, [])]
+
+
+def test_what_no_worker_takes_holds_nothing_up_and_is_said(rig, views, monkeypatch):
+    monkeypatch.setattr("service.offered._PATIENCE_S", 0.05)
+    strange = record(rig, views[:1], segmenter="eyes")
+    good = record(rig, views)
+    unusable = record(rig, views[6:7])
+    rig.feeder.catch_up(rig.source("never-recorded"))
+    record(rig, views[:1], segmenter="ears")
+    rig.start_ready_worker()
+    wait_for(lambda: len(rig.caught_up) == 4, 60)
+    assert sorted(rig.caught_up) == sorted(
+        [(strange, 1, [0]), (good, 10, []), (unusable, 1, []), ("never-recorded", 0, [])]
+    )
+    wait_for_skeleton(rig, good)
