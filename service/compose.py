@@ -33,7 +33,7 @@ from service.http.access import Access
 from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
 from service.offered import ScanSource
-from service.rig import PartStatus, ScanSpec
+from service.rig import CAUGHT_UP, PartStatus, ScanSpec
 from service.rig_file import WATCHDOG_HZ, RigFile
 from service.scan import Attachments, Stage
 from service.supervisor import Supervised
@@ -99,15 +99,11 @@ class BusFeed:
 
     def begin(self, spec: ScanSpec, path: Path) -> None:
         """Turn to a scan."""
-        part = path.with_name(path.name + ".part")
-        self._feeder.begin(
-            ScanSource(
-                scan_id=spec.scan_id,
-                config=spec.config,
-                segmenter=spec.segmenter,
-                recording=lambda: path if path.exists() else part,
-            )
-        )
+        self._feeder.begin(_source(spec, path))
+
+    def catch_up(self, spec: ScanSpec, path: Path) -> None:
+        """Have the views of a recording sent that has ended before."""
+        self._feeder.catch_up(_source(spec, path))
 
     def offer(self, scan_id: str, index: int) -> None:
         """Have a recorded view sent."""
@@ -126,6 +122,16 @@ class BusFeed:
         return self._feeder.flush(timeout_s)
 
 
+def _source(spec: ScanSpec, path: Path) -> ScanSource:
+    part = path.with_name(path.name + ".part")
+    return ScanSource(
+        scan_id=spec.scan_id,
+        config=spec.config,
+        segmenter=spec.segmenter,
+        recording=lambda: path if path.exists() else part,
+    )
+
+
 @contextmanager
 def composed(
     options: ServeOptions,
@@ -141,7 +147,14 @@ def composed(
         session = stack.enter_context(open_session(listen=endpoint))
         stack.enter_context(Supervised("worker", worker_command(options, endpoint)))
         keys = Keys(site=options.site, rig=options.rig)
-        feeder = stack.enter_context(ViewFeeder(session, keys, lambda *news: announce(*news)))
+        feeder = stack.enter_context(
+            ViewFeeder(
+                session,
+                keys,
+                lambda *news: announce(*news),
+                lambda *news: announce_caught_up(*news),
+            )
+        )
         rig = LocalRig(
             RigParts(
                 arm=hardware.arm,
@@ -157,6 +170,9 @@ def composed(
 
         def announce(scan_id: str, document: bytes) -> None:
             rig.announce(scan_id, "skeleton", {"bytes": len(document)})
+
+        def announce_caught_up(scan_id: str, views: int, refused: Sequence[int]) -> None:
+            rig.announce(scan_id, CAUGHT_UP, {"views": views, "refused": list(refused)})
 
         stack.enter_context(rig)
         rig.subscribe(stack.enter_context(Broadcast(session, keys, rig.pose)).event)

@@ -44,6 +44,10 @@ class Feed(Protocol):
         """A scan begins, or goes on; its recording grows at `path` (`.part`)."""
         ...
 
+    def catch_up(self, spec: ScanSpec, path: Path) -> None:
+        """A scan has ended without its whole skeleton; its recording is at `path` (`.part`)."""
+        ...
+
     def offer(self, scan_id: str, index: int) -> None:
         """A view is safe on disk."""
         ...
@@ -233,6 +237,10 @@ class LocalRig:
             if candidate.exists():
                 return candidate
         raise UnknownScanError(f"there is no recording of scan {scan_id}")
+
+    def catch_up(self, spec: ScanSpec) -> None:
+        """Have the views of an ended scan fed; see `Rig.catch_up`."""
+        self._parts.feed.catch_up(spec, self._path(spec.scan_id))
 
     def skeleton(self, scan_id: str) -> bytes | None:
         """Return the newest skeleton document of a scan."""

@@ -22,6 +22,8 @@ class ScanState(StrEnum):
 
 
 FINISHED = frozenset({ScanState.DONE, ScanState.CANCELLED, ScanState.FAILED})
+CAUGHT_UP = "caught_up"
+"""The kind of event that says: nothing more of an earlier scan will be fed to a worker."""
 
 
 SLOWEST_MPS = 0.005
@@ -173,6 +175,13 @@ class Rig(Protocol):
 
     def recording_path(self, scan_id: str) -> Path:
         """Return where the recording is (`.part` while it grows). Raises UnknownScanError."""
+        ...
+
+    def catch_up(self, spec: ScanSpec) -> None:
+        """Have the worker fed with the recording of an ended scan, when it has time for it.
+
+        An event CAUGHT_UP tells when it is through, with or without a skeleton of all views.
+        """
         ...
 
     def skeleton(self, scan_id: str) -> bytes | None:

@@ -15,6 +15,7 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError
 
 from service.bell import Bell
 from service.catalogue import Catalogue, ScanRecord
+from service.incomplete import incomplete
 from service.rig import (
     FINISHED,
     Rig,
@@ -41,7 +42,7 @@ class ScanOverError(RigError):
 
 
 class Scans:
-    """Entering marks what a killed service left, and begins to note the rig's events.
+    """Entering takes up what a killed service left, and begins to note the rig's events.
 
     Every method may be called from any thread; none may be called in an event loop.
     """
@@ -56,8 +57,9 @@ class Scans:
         self._journal = Thread(target=self._write_journal, name="journal", daemon=True)
 
     def __enter__(self) -> Self:
-        """Recover the catalogue and follow the rig."""
-        for scan_id in self.catalogue.recover():
+        """Recover the catalogue, follow the rig, and have skeletons made that are not complete."""
+        interrupted = self.catalogue.recover()
+        for scan_id in interrupted:
             logger.warning("scan was under way when the service ended scan_id=%s", scan_id)
             self._rig.hold(f"the service ended during scan {scan_id}")
             self._add_event(self.record(scan_id).status, "interrupted", {})
@@ -68,6 +70,8 @@ class Scans:
             self._rig.hold("the arm was stopped before the service was started again")
         self._rig.subscribe(self._events.put)
         self._journal.start()
+        for spec in incomplete(self.catalogue, interrupted):
+            self._rig.catch_up(spec)
         return self
 
     def __exit__(

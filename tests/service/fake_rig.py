@@ -36,6 +36,7 @@ class FakeRig:
         self.stops = 0
         self.acknowledged: list[str] = []
         self.holds: list[str] = []
+        self.to_catch_up: list[str] = []
         self._scans: dict[str, ScanStatus] = {}
         self._skeletons: dict[str, bytes] = {}
         self._listeners: list[Callable[[RigEvent], None]] = []
@@ -145,6 +146,9 @@ class FakeRig:
     def recording_path(self, scan_id: str) -> Path:
         self.status(scan_id)
         return self.recording
+
+    def catch_up(self, spec: ScanSpec) -> None:
+        self.to_catch_up.append(spec.scan_id)
 
     def skeleton(self, scan_id: str) -> bytes | None:
         return self._skeletons.get(scan_id)

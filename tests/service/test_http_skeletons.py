@@ -2,8 +2,10 @@ import hashlib
 import json
 import os
 import re
+import sqlite3
 import threading
 import time
+from contextlib import closing
 
 import cv2
 import httpx2
@@ -18,6 +20,7 @@ from canopy_skel.recording import read_recording
 from canopy_skel.schema import schema_text
 from service.http.negotiation import best_media_type, wait_s
 from service.http.skeletons import MEDIA_TYPES
+from service.rig import CAUGHT_UP
 
 
 def with_two_revisions(live):
@@ -142,6 +145,78 @@ def test_skeletons_outlive_the_service(tmp_path):
         live.rig.publish(scan_id, document := skeleton(scan_id, 1))
     with serving(tmp_path, FakeRig()) as live:
         assert live.http.get(f"/v1/scans/{scan_id}/skeleton").content == document
+
+
+def finished(live, key, *documents):
+    """Scan three views, of which came these documents (bytes of a scan id); return the id."""
+    scan_id = live.start(key)
+    for index in range(3):
+        live.rig.photograph(scan_id, index)
+    for document in documents:
+        live.rig.publish(scan_id, document(scan_id))
+    live.rig.finish(scan_id)
+    path = f"/v1/scans/{scan_id}"
+    wait_until(lambda: live.http.get(path).json()["state"] == "done")
+    events = live.http.get(f"{path}/events").text  # it ends when all is noted
+    assert "event: done" in events
+    return scan_id
+
+
+def preview(scan_id):
+    return json.dumps(json.loads(skeleton(scan_id, 3)) | {"preview": True}).encode()
+
+
+def without_one(scan_id):
+    """A skeleton of two views and the reason why it is not of three."""
+    document = json.loads(skeleton(scan_id, 2))
+    document["views"]["rejected"] = [{"index": 2, "reason": "dark"}]
+    return json.dumps(document).encode()
+
+
+def test_scans_without_the_skeleton_of_all_their_views_are_caught_up_on_by_the_next_service(
+    tmp_path,
+):
+    with serving(tmp_path) as live:
+        finished(live, "whole", lambda scan_id: skeleton(scan_id, 3))
+        lacking = [
+            finished(live, "two of three", lambda scan_id: skeleton(scan_id, 2)),
+            finished(live, "none"),
+            finished(live, "a preview", preview),
+        ]
+        finished(live, "one is rejected", without_one)
+        torn = finished(live, "torn", lambda scan_id: skeleton(scan_id, 3, length_m=2.0))
+        under_way = live.start("under way")
+        sha256 = hashlib.sha256(skeleton(torn, 3, length_m=2.0)).hexdigest()
+    (tmp_path / "skeletons" / f"{sha256}.json").write_bytes(b"{")
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.to_catch_up == [*lacking, torn, under_way]
+
+
+@pytest.mark.parametrize(
+    ("end", "times"),
+    [({"views": 3, "refused": []}, 1), ({"views": 3, "refused": [1]}, 3), ({"views": 0}, 3)],
+)
+def test_a_recording_that_gives_no_whole_skeleton_is_not_fed_for_ever(tmp_path, end, times):
+    with serving(tmp_path) as live:
+        scan_id = finished(live, "k1")
+    with serving(tmp_path, FakeRig()) as live:  # no worker comes meanwhile
+        assert live.rig.to_catch_up == [scan_id]
+    for _ in range(times):
+        with serving(tmp_path, FakeRig()) as live:
+            assert live.rig.to_catch_up == [scan_id]
+            live.rig.tell(scan_id, CAUGHT_UP, **({"refused": []} | end))
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.to_catch_up == []
+
+
+def test_a_request_that_cannot_be_read_any_more_does_not_keep_the_service_from_starting(tmp_path):
+    with serving(tmp_path) as live:
+        strange, good = finished(live, "k1"), finished(live, "k2")
+    with closing(sqlite3.connect(tmp_path / "catalogue.sqlite")) as catalogue:
+        catalogue.execute("UPDATE scans SET request = '{}' WHERE scan_id = ?", [strange])
+        catalogue.commit()
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.to_catch_up == [good]
 
 
 def test_the_schema_is_served(idle):

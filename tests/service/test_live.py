@@ -127,6 +127,23 @@ def test_a_stop_outlives_the_service(service):
 
 
 @pytest.mark.timeout(200)
+def test_a_scan_that_had_no_worker_gets_its_skeleton_from_the_next_service(service, tmp_path):
+    rig = service.launch()
+    wait_until_ready(rig.http)
+    scan_id = rig.start()
+    rig.wait(scan_id, "running", views=1)
+    (worker,) = processes("service.worker", service.process.pid)
+    os.kill(worker, signal.SIGSTOP)
+    rig.wait(scan_id, "done", views=10)
+    os.kill(worker, signal.SIGKILL)
+    service.kill()
+    rig = service.launch()
+    replayed = rig.replayed(scan_id, tmp_path / "replayed")
+    assert rig.skeleton(scan_id) != replayed
+    rig.wait_for_skeleton(scan_id, replayed)
+
+
+@pytest.mark.timeout(200)
 def test_a_full_disk_stops_the_scan_and_costs_nothing(service):
     rig = service.launch()
     wait_until_ready(rig.http)

@@ -86,6 +86,9 @@ class Collected:
     def begin(self, spec, path):
         pass
 
+    def catch_up(self, spec, path):
+        pass
+
     def offer(self, scan_id, index):
         self.offered.append(index)
 
