@@ -2,12 +2,12 @@
 
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Lock, Thread
+from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Any, Self
 
@@ -55,6 +55,7 @@ class Scans:
         self._starting = Lock()
         self._refreshing = Lock()
         self._journal = Thread(target=self._write_journal, name="journal", daemon=True)
+        self._closing = Event()
 
     def __enter__(self) -> Self:
         """Recover the catalogue, follow the rig, and have skeletons made that are not complete."""
@@ -70,8 +71,10 @@ class Scans:
             self._rig.hold("the arm was stopped before the service was started again")
         self._rig.subscribe(self._events.put)
         self._journal.start()
-        for spec in incomplete(self.catalogue, interrupted):
-            self._rig.catch_up(spec)
+        self._catching_up = Thread(
+            target=self._catch_up, args=(interrupted,), name="catch up", daemon=True
+        )
+        self._catching_up.start()
         return self
 
     def __exit__(
@@ -81,8 +84,10 @@ class Scans:
         traceback: TracebackType | None,
     ) -> None:
         """Note what is still to be noted, unless the rig holds it up."""
+        self._closing.set()
         self._events.put(None)
         self._journal.join(_JOURNAL_TIMEOUT_S)
+        self._catching_up.join(_JOURNAL_TIMEOUT_S)
 
     def start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
         """Start a scan and return its status fields; once for each key, whatever happens.
@@ -264,6 +269,13 @@ class Scans:
             return self._rig.recording_path(scan_id)
         except UnknownScanError:
             return None
+
+    def _catch_up(self, interrupted: Collection[str]) -> None:
+        """Look through many scans and skeletons: beside the service, which answers meanwhile."""
+        for spec in incomplete(self.catalogue, interrupted):
+            if self._closing.is_set():
+                return
+            self._rig.catch_up(spec)
 
     def _write_journal(self) -> None:
         while (event := self._events.get()) is not None:
