@@ -175,18 +175,35 @@ def turned(seen: Observations, config: FusionConfig) -> Observations:
 
 
 def forest(points: FloatArray, directions: FloatArray, reach_m: float) -> IntArray:
-    """Return the minimum spanning forest (E, 2) over pairs within reach, across directions dear."""
+    """Return the minimum spanning forest (E, 2) over pairs within reach.
+
+    A pair is the dearer the less its directions agree, and the less it runs along either: a side
+    branch is to meet its parent in its own direction, not by the shortest way.
+    """
     if len(points) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray").astype(np.int64)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-    cosine = np.abs(np.sum(directions[pairs[:, 0]] * directions[pairs[:, 1]], axis=1))
-    weights = np.maximum(length * (2.0 - cosine), 1e-12)
+    a, b = pairs.T
+    way = points[b] - points[a]
+    length = np.linalg.norm(way, axis=1)
+    along = way / np.maximum(length, 1e-12)[:, None]
+    turns = (
+        _turn(directions[a], directions[b])
+        + _turn(directions[a], along)
+        + _turn(directions[b], along)
+    )
+    weights = np.maximum(length * (1.0 + turns), 1e-12)
     tree = minimum_spanning_tree(
         coo_array((weights, pairs.T), shape=(len(points),) * 2).tocsr()
     ).tocoo()
     return np.stack([tree.row, tree.col], axis=1).astype(np.int64)
+
+
+def _turn(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return 0 for parallel unit vectors (N, 3), up to 1 across."""
+    cosine: FloatArray = np.abs(np.sum(one * other, axis=1))
+    return 1.0 - cosine
 
 
 def _smoothed(points: FloatArray, edges: IntArray, chosen: BoolArray, steps: int) -> FloatArray:

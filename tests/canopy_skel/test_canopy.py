@@ -17,7 +17,7 @@ from canopy_skel.document import Method, build_document, from_json, to_json
 from canopy_skel.errors import UsageError
 from canopy_skel.evidence import HIDDEN, count_evidence, evidence_of, is_empty
 from canopy_skel.evidence import WOOD as WOOD_SEEN
-from canopy_skel.fusion import FusionConfig, Observations, fuse, turned
+from canopy_skel.fusion import FusionConfig, Observations, forest, fuse, turned
 from canopy_skel.geometry import transform_points
 from canopy_skel.kernels import profile
 from canopy_skel.observe import observe
@@ -327,10 +327,25 @@ def test_fragments_turn_along_what_lies_around_them_and_instances_do_not():
     assert np.array_equal(found[0], directions[0])
 
 
+@given(st.floats(30, 60), st.floats(0.0, 0.006))
+def test_a_side_branch_meets_its_parent_in_its_own_direction(angle_deg, shift_m):
+    trunk = np.column_stack([np.arange(-0.06, 0.06, 0.006), np.zeros((20, 2))])
+    way = np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg)), 0.0])
+    away_m = 0.008 / way[1] + 0.006 * np.arange(8)
+    branch = [shift_m, 0.0, 0.0] + away_m[:, None] * way
+    points = np.concatenate([trunk, branch])
+    directions = np.concatenate([np.tile([1.0, 0, 0], (20, 1)), np.tile(way, (8, 1))])
+    edges = forest(points, directions, 0.017)
+    assert len(edges) == len(points) - 1
+    [fork] = edges[(edges.min(axis=1) < 20) & (edges.max(axis=1) >= 20)]
+    first = points[fork.max()] - points[fork.min()]
+    assert first @ way / np.linalg.norm(first) > np.cos(np.radians(40))
+
+
 @pytest.mark.parametrize("fragments", [True, False])
 def test_what_fragments_show_runs_as_they_point_tips_included(fragments):
     x = np.arange(0.0, 0.06, 0.0061)
-    off_m = 0.005 * (-1.0) ** np.arange(len(x))
+    off_m = 0.002 * (-1.0) ** np.arange(len(x))
     seen = Observations(
         points_in_base=np.column_stack([x, off_m, np.zeros(len(x))]),
         directions=np.tile([1.0, 0.0, 0.0], (len(x), 1)),
