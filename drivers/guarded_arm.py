@@ -15,6 +15,9 @@ from drivers import kinematics
 from drivers.errors import SpeedCapError, WorkspaceError
 from drivers.protocols import Arm, ArmState, LinearMove, Move
 
+_STAYS_M = 0.001
+"""A line that moves the flange by less only turns it."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class KeepOut:
@@ -109,6 +112,26 @@ def check(move: Move, state: ArmState, limits: Limits) -> None:
     _check_rates(move, joints, _check_places(joints, limits), limits)
 
 
+def tool_lead(base_from_tool0: FloatArray, state: ArmState, limits: Limits) -> float:
+    """Return how many times as fast as the flange the tool's fastest point goes on a line; >= 1.
+
+    A tool that turns on its way sweeps. Where the flange stays, controllers turn at the number they
+    are given for the speed, in rad/s, and no point of the tool is a metre away.
+
+    Raises:
+        UnreachableError: the arm cannot follow the line at all.
+    """
+    if not limits.tool_points_in_tool0.any():
+        return 1.0
+    joints = kinematics.straight_joints(
+        state.pose.base_from_tool0, base_from_tool0, state.joints_rad
+    )
+    shift_m = _shifts_m(_tool_points(joints, limits.tool_points_in_tool0))
+    if shift_m[:, 0].sum() <= _STAYS_M:
+        return 1.0
+    return float((shift_m.max(axis=1) / shift_m[:, 0]).max())
+
+
 def check_posture(joints_rad: FloatArray, limits: Limits) -> None:
     """Raise WorkspaceError if the arm must not stand with these joints (6,)."""
     _check_places(joints_rad[None], limits)
@@ -180,15 +203,23 @@ def _check_plane(points_in_base: FloatArray, keep_out: KeepOut, clearance_m: flo
 def _check_rates(move: Move, joints_rad: FloatArray, tool: FloatArray, limits: Limits) -> None:
     """Check what the caps on one space mean in the other: joints on lines, tool on joint moves."""
     turn_rad = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
-    shift_m = np.linalg.norm(np.diff(tool, axis=0), axis=2).max(axis=1)
+    shift_m = _shifts_m(tool)
     if isinstance(move, LinearMove):
-        flange_m = np.linalg.norm(np.diff(tool[:, 0], axis=0), axis=1)
-        step_s = flange_m / move.speed_mps
+        moving = shift_m[:, 0].sum() > _STAYS_M
+        step_s = shift_m[:, 0] / move.speed_mps * moving
         fastest = _fastest(turn_rad, step_s)
         _cap("a joint's speed on this line,", fastest, limits.joint_speed_rps, "rad/s,")
+        fastest = _fastest(shift_m.max(axis=1), step_s)
+        _cap("the tool's speed on this line,", fastest, limits.speed_mps, "m/s,")
     else:
-        fastest = _fastest(shift_m, turn_rad / move.speed_rps)
+        fastest = _fastest(shift_m.max(axis=1), turn_rad / move.speed_rps)
         _cap("the tool's speed on this joint move,", fastest, limits.speed_mps, "m/s,")
+
+
+def _shifts_m(tool: FloatArray) -> FloatArray:
+    """Return how far flange and tool points (N, K, 3) move in each step, (N - 1, K)."""
+    shifts: FloatArray = np.linalg.norm(np.diff(tool, axis=0), axis=2)
+    return shifts
 
 
 def _fastest(way: FloatArray, duration_s: FloatArray) -> float:

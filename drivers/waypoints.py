@@ -9,13 +9,13 @@ import numpy as np
 from canopy_skel.geometry import FloatArray
 from drivers import kinematics
 from drivers.errors import MoveRefusedError, UnreachableError
-from drivers.guarded_arm import Limits, check, check_posture
+from drivers.guarded_arm import Limits, check, check_posture, tool_lead
 from drivers.protocols import ArmMode, ArmState, JointMove, LinearMove, Move, ToolPose
 
 JOINT_SPEEDS_RPS = (0.8, 0.4, 0.2, 0.1)
-"""Of the leading joint, where the flange may go at USUAL_SPEED_MPS; in proportion where less was
-asked for."""
-USUAL_SPEED_MPS = 0.25
+"""Of the leading joint, where the flange may go at USUAL_SPEED_MPS and speed up with
+USUAL_ACCELERATION_MPS2; in proportion where less was asked for."""
+USUAL_SPEED_MPS, USUAL_ACCELERATION_MPS2 = 0.25, 0.5
 
 
 READY_JOINTS_RAD = np.array([np.pi, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0])
@@ -32,7 +32,7 @@ def moves_to(
 ) -> tuple[Move, ...]:
     """Return the moves from `state` to a pose: one if possible, else two by way of readiness.
 
-    None moves flange or tool faster than asked, through the joints neither.
+    None moves flange or tool faster than asked, or has a joint turn faster than the limits allow.
 
     Raises:
         MoveRefusedError: there is no allowed way; the reason is that of the direct one.
@@ -41,7 +41,7 @@ def moves_to(
     try:
         return (move_to(state, base_from_tool0, limits, **speeds),)
     except MoveRefusedError as refusal:
-        ready = _turn(state, [READY_JOINTS_RAD], limits, speed_mps)
+        ready = _turn(state, [READY_JOINTS_RAD], limits, **speeds)
         if ready is None:
             raise
         try:
@@ -64,13 +64,18 @@ def move_to(
         MoveRefusedError: neither is allowed; the reason is that of the straight one if the arm can
             be at the pose at all.
     """
-    straight = LinearMove(
-        base_from_tool0=base_from_tool0, speed_mps=speed_mps, acceleration_mps2=acceleration_mps2
-    )
+    speeds = {"speed_mps": speed_mps, "acceleration_mps2": acceleration_mps2}
     try:
+        lead = tool_lead(base_from_tool0, state, limits)
+        slower = 1.0 if lead == 1.0 else 0.999 / lead  # a hair under the cap, not beside it
+        straight = LinearMove(
+            base_from_tool0=base_from_tool0,
+            speed_mps=slower * speed_mps,
+            acceleration_mps2=slower * acceleration_mps2,
+        )
         check(straight, state, limits)
     except MoveRefusedError as refusal:
-        return _turn_to(state, base_from_tool0, limits, speed_mps, refusal)
+        return _turn_to(state, base_from_tool0, limits, speeds, refusal)
     return straight
 
 
@@ -78,13 +83,13 @@ def _turn_to(
     state: ArmState,
     base_from_tool0: FloatArray,
     limits: Limits,
-    speed_mps: float,
+    speeds: dict[str, float],
     refusal: MoveRefusedError,
 ) -> Move:
     solutions = kinematics.inverses(base_from_tool0, state.joints_rad)
     if not solutions:
         raise UnreachableError(str(refusal))
-    move = _turn(state, solutions, limits, speed_mps)
+    move = _turn(state, solutions, limits, **speeds)
     if move is None:
         raise _why_not_there(solutions, limits) or refusal
     return move
@@ -104,15 +109,23 @@ def _why_not_there(postures: list[FloatArray], limits: Limits) -> MoveRefusedErr
 
 
 def _turn(
-    state: ArmState, postures: list[FloatArray], limits: Limits, speed_mps: float
+    state: ArmState,
+    postures: list[FloatArray],
+    limits: Limits,
+    *,
+    speed_mps: float,
+    acceleration_mps2: float,
 ) -> JointMove | None:
     """Return an allowed move to one of the postures: near ones first, slower ones last."""
     slower = min(1.0, speed_mps / USUAL_SPEED_MPS)
+    gentler = min(1.0, acceleration_mps2 / USUAL_ACCELERATION_MPS2)
     asked = replace(limits, speed_mps=min(limits.speed_mps, speed_mps))
     for usual_rps, joints in product(JOINT_SPEEDS_RPS, postures):
-        speed_rps = slower * usual_rps
+        usual_rps2 = min(1.0, 2 * slower * usual_rps)
         move = JointMove(
-            joints_rad=joints, speed_rps=speed_rps, acceleration_rps2=min(1.0, 2 * speed_rps)
+            joints_rad=joints,
+            speed_rps=min(slower * usual_rps, limits.joint_speed_rps),
+            acceleration_rps2=min(gentler * usual_rps2, limits.joint_acceleration_rps2),
         )
         try:
             check(move, state, asked)

@@ -77,6 +77,58 @@ def test_a_move_through_the_joints_is_no_faster_than_asked(speed_mps):
     assert through_the_joints
 
 
+TOOL = np.array([[-0.10, 0.0, 0.09], [0.05, 0.07, 0.09], [0.05, -0.07, 0.09]])
+
+
+@pytest.mark.parametrize(
+    ("way_m", "angle_rad", "speed_mps"),
+    [(0.13, 0.52, 0.25), (0.13, 0.52, 0.05), (0.03, 0.52, 0.05), (0.3, 0.0, 0.25)],
+)
+def test_a_tool_that_turns_on_a_line_is_no_faster_than_asked(way_m, angle_rad, speed_mps):
+    limits = Limits(
+        box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1), tool_points_in_tool0=TOOL
+    )
+    goal = turned(angle_rad)
+    goal[2, 3] -= way_m
+    [move] = moves_to(STANDING, goal, limits, speed_mps=speed_mps, acceleration_mps2=0.5)
+    poses = [
+        kinematics.interpolate(STANDING.pose.base_from_tool0, goal, fraction)
+        for fraction in np.linspace(0, 1, 100)
+    ]
+    places = np.array([pose[:3, :3] @ TOOL.T + pose[:3, 3:] for pose in poses])
+    step_s = way_m / 99 / move.speed_mps
+    fastest = np.linalg.norm(np.diff(places, axis=0), axis=1).max() / step_s
+    assert fastest <= 1.001 * speed_mps
+    assert fastest >= 0.9 * speed_mps
+
+
+def test_a_tool_that_only_turns_is_let_turn():
+    limits = Limits(
+        box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1), tool_points_in_tool0=TOOL
+    )
+    [move] = moves_to(STANDING, turned(0.5), limits, speed_mps=0.2, acceleration_mps2=0.5)
+    assert move.speed_mps == 0.2
+
+
+@pytest.mark.parametrize(
+    ("caps", "asked_mps2"),
+    [({"joint_speed_rps": 0.05}, 0.5), ({"joint_acceleration_rps2": 0.1}, 0.5), ({}, 0.01)],
+)
+def test_joint_moves_keep_to_caps_and_to_the_acceleration_asked_for(caps, asked_mps2):
+    limits = Limits(box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1), **caps)
+    state, through_the_joints = STANDING, 0
+    for base_from_camera in camera_path(70)[::9]:
+        pose = base_from_camera @ invert(TOOL_FROM_CAMERA)
+        for move in moves_to(state, pose, limits, speed_mps=0.1, acceleration_mps2=asked_mps2):
+            if isinstance(move, JointMove):
+                through_the_joints += 1
+                assert move.speed_rps <= limits.joint_speed_rps
+                assert move.acceleration_rps2 <= limits.joint_acceleration_rps2
+                assert move.acceleration_rps2 <= 2 * asked_mps2  # of a flange within a metre
+            state = after(state, move)
+    assert through_the_joints
+
+
 def fastest_mps(state, move):
     """How fast the flange gets while the leading joint turns at full speed."""
     way = kinematics.turned_joints(state.joints_rad, move.joints_rad, 0.01)
