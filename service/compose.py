@@ -142,6 +142,7 @@ def composed(
     `hardware_of` brings other hardware than the options name.
     """
     with ExitStack() as stack:
+        catalogue = stack.enter_context(Catalogue(options.data))  # refused before anything starts
         hardware = stack.enter_context((hardware_of or _hardware)(options))
         endpoint = options.bus or f"tcp/127.0.0.1:{free_port()}"
         session = stack.enter_context(open_session(listen=endpoint))
@@ -176,7 +177,6 @@ def composed(
 
         stack.enter_context(rig)
         rig.subscribe(stack.enter_context(Broadcast(session, keys, rig.pose)).event)
-        catalogue = stack.enter_context(Catalogue(options.data))
         caps = SpeedCaps(
             speed_mps=hardware.limits.speed_mps,
             acceleration_mps2=hardware.limits.acceleration_mps2,

@@ -9,8 +9,8 @@ from canopy_skel.geometry import FloatArray, rotation_from_quaternion, transform
 
 _UNIT_TOLERANCE = 0.01
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 
 
 class Fields(BaseModel):

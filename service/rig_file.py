@@ -18,6 +18,7 @@ from drivers import guarded_arm
 from drivers.oak.messages import OakConfig
 from drivers.ur5.messages import Ur5Config
 from service.pose_fields import Fields, Finite, Pose, Positive
+from service.rig import GENTLEST_MPS2, SLOWEST_MPS
 
 UR5_PAYLOAD_KG = 5.0
 WATCHDOG_HZ = 2.0
@@ -25,21 +26,35 @@ WATCHDOG_HZ = 2.0
 _UNIT_TOLERANCE = 0.01
 _DOCS = "docs/rig.md shows a whole file"
 
-Point = tuple[Finite, Finite, Finite]
+# What a UR5 and what hangs on it can have: a number in millimetres or degrees is outside.
+_InReach = Annotated[Finite, Field(ge=-1.5, le=1.5)]
+_OnTool = Annotated[Finite, Field(ge=-0.5, le=0.5)]
+Place = tuple[_InReach, _InReach, _InReach]
+PlaceOnTool = tuple[_OnTool, _OnTool, _OnTool]
+Speed = Annotated[Positive, Field(ge=SLOWEST_MPS, le=1.0)]
+Acceleration = Annotated[Positive, Field(ge=GENTLEST_MPS2, le=2.5)]
+JointSpeed = Annotated[Positive, Field(ge=0.01, le=3.14)]
+JointAcceleration = Annotated[Positive, Field(ge=0.01, le=10.0)]
 
 
 class ArmFields(Fields):
     """`[arm]`: a UR5 and what its flange carries, camera and mount together."""
 
-    host: Annotated[str, Field(min_length=1)]
-    payload_kg: Annotated[float, Field(ge=0, le=UR5_PAYLOAD_KG, allow_inf_nan=False)]
-    payload_cog_m: Point
+    host: Annotated[str, Field(pattern=r"^\S+$")]
+    payload_kg: Annotated[Finite, Field(ge=0, le=UR5_PAYLOAD_KG)]
+    payload_cog_m: PlaceOnTool
+
+
+class PoseOnTool(Pose):
+    """Where something is on the flange."""
+
+    position: PlaceOnTool
 
 
 class CameraFields(Fields):
     """`[camera]`: an OAK-D, and its place on the flange as hand-eye calibration found it."""
 
-    tool_from_camera: Pose
+    tool_from_camera: PoseOnTool
     device: str = ""
     eye: Literal["color", "left"] = "color"
 
@@ -48,8 +63,8 @@ class KeepOutFields(Fields):
     """`[[limits.keep_outs]]`: the arm stays where normal · p >= offset_m, in base."""
 
     name: Annotated[str, Field(min_length=1)]
-    normal: Point
-    offset_m: Finite
+    normal: tuple[Finite, Finite, Finite]
+    offset_m: _InReach
 
     @field_validator("normal")
     @classmethod
@@ -63,15 +78,15 @@ class KeepOutFields(Fields):
 class LimitFields(Fields):
     """`[limits]`: what the arm may do; see `drivers.guarded_arm.Limits`."""
 
-    box_min_m: Point
-    box_max_m: Point
-    tool_points_m: Annotated[list[Point], Field(min_length=1)]
+    box_min_m: Place
+    box_max_m: Place
+    tool_points_m: Annotated[list[PlaceOnTool], Field(min_length=1)]
     keep_outs: tuple[KeepOutFields, ...] = ()
-    body_radius_m: Positive = 0.15
-    speed_mps: Positive = 0.25
-    acceleration_mps2: Positive = 0.5
-    joint_speed_rps: Positive = 1.0
-    joint_acceleration_rps2: Positive = 1.5
+    body_radius_m: Annotated[Positive, Field(ge=0.05, le=0.3)] = 0.15
+    speed_mps: Speed = 0.25
+    acceleration_mps2: Acceleration = 0.5
+    joint_speed_rps: JointSpeed = 1.0
+    joint_acceleration_rps2: JointAcceleration = 1.5
 
     @model_validator(mode="after")
     def _has_room(self) -> Self:

@@ -6,6 +6,7 @@ and begins at the first missing waypoint. There is no other way to continue, so 
 power cut is the way after a pause.
 """
 
+import json
 import logging
 import threading
 import time
@@ -15,10 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from canopy_skel.errors import CanopyError
+from canopy_skel.errors import CanopyError, RecordingError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
-from canopy_skel.recording import RecordingWriter, carry_over, read_recording
+from canopy_skel.recording import RecordingWriter, carry_over, metadata_of, read_recording
 from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
 from drivers.protocols import (
@@ -42,6 +43,7 @@ Attachments = Callable[[Collection[int] | None], Mapping[str, bytes]]
 """Files that go with a finished recording, by name, from when its pictures were exposed (ns of the
 host's monotonic clock); None where an earlier life of the service took some of them."""
 
+_HAND_EYE = "tool_from_camera"
 SLOWED_DOWN = 2.0
 """Times the planned duration that a move may take: the pendant's slider slows moves down."""
 
@@ -145,8 +147,11 @@ class ScanSession:
         """Stop the arm at once and end the session as `wanted`.
 
         When this returns, the session begins no further motion. The first stop does not wait for
-        the lock, which is held while a move is being begun; the second is for that move.
+        the lock, which is held while a move is being begun; the second is for that move. A session
+        that has ended moves nothing: the arm may be another's.
         """
+        if not self.running:
+            return
         self._wanted = self._wanted or wanted
         self._tools.arm.stop()
         with self._lock:
@@ -194,7 +199,10 @@ class ScanSession:
     def _record(self) -> None:
         metadata = {"scan_id": self._spec.scan_id, "tree_id": self._spec.tree_id}
         metadata["config_sha256"] = self._spec.config.sha256()
+        metadata[_HAND_EYE] = json.dumps(self._tools.tool_from_camera.tolist())
         source = set_aside(self.path)
+        if source is not None:
+            _require_same(metadata[_HAND_EYE], source)
         with RecordingWriter(
             self.path, metadata, tool_from_camera=self._tools.tool_from_camera
         ) as writer:
@@ -311,6 +319,15 @@ class ScanSession:
         with self._lock:
             self._state, self._detail = state, detail
         self._report(str(state), {"detail": detail} if detail else {})
+
+
+def _require_same(hand_eye: str, source: Path) -> None:
+    """Refuse to go on with views of another hand-eye calibration: they would not fit together."""
+    begun_with = metadata_of(source).get(_HAND_EYE, hand_eye)
+    if begun_with != hand_eye:
+        raise RecordingError(
+            "this scan was begun with another tool_from_camera; cancel it and scan the tree anew"
+        )
 
 
 def set_aside(path: Path) -> Path | None:

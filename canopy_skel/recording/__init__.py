@@ -5,7 +5,13 @@ from canopy_skel.recording.carry import carry_over
 from canopy_skel.recording.decode import view_from_messages
 from canopy_skel.recording.encode import EncodedPicture, encode_view
 from canopy_skel.recording.options import ROS2_TOPICS, TopicOptions
-from canopy_skel.recording.reader import Recording, TopicSummary, messages_of_view, read_recording
+from canopy_skel.recording.reader import (
+    Recording,
+    TopicSummary,
+    messages_of_view,
+    metadata_of,
+    read_recording,
+)
 from canopy_skel.recording.recover import RecoverReport, cut_recording, recover
 from canopy_skel.recording.writer import RecordingWriter
 
@@ -22,6 +28,7 @@ __all__ = [
     "cut_recording",
     "encode_view",
     "messages_of_view",
+    "metadata_of",
     "read_recording",
     "recover",
     "view_from_messages",

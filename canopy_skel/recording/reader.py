@@ -378,6 +378,15 @@ def _part(file: McapFile, ref: MessageRef, reader: MessageReader) -> Part:
     )
 
 
+def metadata_of(path: Path) -> dict[str, str]:
+    """Return what a recording says of its scan, also one without views; nothing if it says nothing.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    return _metadata(scan_mcap(path), METADATA_RECORD)
+
+
 def _metadata(file: McapFile, name: str) -> dict[str, str]:
     for record in file.metadata:
         if record.name == name:

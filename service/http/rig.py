@@ -7,7 +7,7 @@ from fastapi import APIRouter
 
 from service.http.access import COMMAND
 from service.http.context import Here
-from service.http.problems import Problem
+from service.http.problems import STOP_PATH, Problem
 from service.http.requests import AcknowledgeBody, PlanBody, plan_spec
 from service.rig import PartStatus
 from service.scans import status_fields
@@ -50,7 +50,7 @@ def show_rig(here: Here) -> dict[str, Any]:
     }
 
 
-@stop_router.post("/v1/rig:stop")
+@stop_router.post(STOP_PATH)
 async def stop(here: Here) -> dict[str, str]:
     """Stop the arm now; no condition, never queued, harmless when repeated."""
     await asyncio.to_thread(here.scans.stop)  # not in the pool that other requests may fill

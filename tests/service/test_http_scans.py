@@ -1,4 +1,5 @@
 import json
+import socket
 import sqlite3
 import threading
 import time
@@ -282,6 +283,18 @@ def test_a_scan_can_be_cancelled_while_it_starts(live, monkeypatch):
     starting.join()
     assert answer.json()["state"] == "cancelled"
     assert live.rig.status(scan["scan_id"]).state is ScanState.CANCELLED
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Transfer-Encoding": "chunked"}, {"Content-Length": str(1 << 21)}]
+)
+def test_no_body_keeps_anybody_from_stopping_the_arm(live, headers):
+    with socket.create_connection((live.http.base_url.host, live.http.base_url.port)) as wire:
+        lines = ["POST /v1/rig:stop HTTP/1.1", "Host: localhost"]
+        lines += [f"{name}: {value}" for name, value in headers.items()]
+        wire.sendall("\r\n".join([*lines, "", ""]).encode())
+        assert b" 200 " in wire.recv(64)
+    assert live.rig.stops == 1
 
 
 def test_stop_and_acknowledge(live):

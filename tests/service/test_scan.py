@@ -230,6 +230,50 @@ def test_what_is_attached_is_of_the_pictures_in_the_recording_alone(rig, camera)
     assert kept <= set(camera.stamps_ns[5:])  # the fifth was spoiled
 
 
+def test_ending_a_scan_that_rests_leaves_the_one_under_way_alone(rig, fake):
+    rig.start(spec("scan-1"))
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    rig.start(spec("scan-2"))
+    for _ in range(3):
+        wait_until_moving(rig, fake)
+        rig.pause("scan-1")
+    assert rig.cancel("scan-1").state is ScanState.CANCELLED
+    assert wait_for(rig, "scan-2", ScanState.DONE, ScanState.STOPPED).state is ScanState.DONE
+
+
+def test_views_of_another_hand_eye_calibration_are_not_gone_on_with(fake, camera, tmp_path):
+    def rig_with(tool_from_camera):
+        arm = GuardedArm(Ur5Arm(Ur5Config(host=fake.host, watchdog_hz=0.2)), LIMITS)
+        return LocalRig(
+            RigParts(
+                arm=arm,
+                camera=camera,
+                limits=LIMITS,
+                tool_from_camera=tool_from_camera,
+                feed=Collected(),
+                data=tmp_path,
+            )
+        )
+
+    with rig_with(TOOL_FROM_CAMERA) as rig:
+        rig.start(spec())
+        while rig.status("scan-1").views_done < 2:
+            time.sleep(0.005)
+        rig.pause("scan-1")
+    moved = TOOL_FROM_CAMERA.copy()
+    moved[0, 3] += 0.01
+    with rig_with(moved) as rig:
+        rig.start(spec(), views_before=2)
+        status = wait_for(rig, "scan-1", ScanState.DONE, ScanState.STOPPED)
+        assert "begun with another tool_from_camera" in status.detail
+    with rig_with(TOOL_FROM_CAMERA) as rig:
+        rig.start(spec(), views_before=2)
+        wait_for(rig, "scan-1", ScanState.DONE)
+        assert len(views_of(rig, "scan-1")) == 4
+
+
 def test_pictures_of_an_earlier_life_are_said_not_to_be_known(rig, tmp_path):
     rig.start(spec())
     while rig.status("scan-1").views_done < 1:
