@@ -33,6 +33,10 @@ def scan(
         bool,
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
     ] = False,
+    speed: Annotated[
+        float | None,
+        typer.Option(help="Of flange and tool in m/s; without, 0.25 or the rig's cap."),
+    ] = None,
     url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
     key_file: Annotated[
         Path | None, typer.Option(help="File with the service's key, if it has one.")
@@ -63,6 +67,7 @@ def scan(
             "segmenter": segmenter,
             "farthest_m": farthest,
             "rooted": rooted,
+            "speed_mps": speed,
         }
         result = run_scan(url, body, show, key=key)
     status = result.status

@@ -31,7 +31,8 @@ def serve(
         typer.Option(help="File with the key that commands must bring; needed beyond 127.0.0.1."),
     ] = None,
     name: Annotated[
-        list[str] | None, typer.Option(help="Host name it is known by; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Host name it is known by, without port; may be repeated."),
     ] = None,
     data: Annotated[Path, typer.Option(help="Folder of recordings and catalogue.")] = Path("data"),
     site: Annotated[str, typer.Option(help="Name of the site on the bus.")] = "orchard",
@@ -81,6 +82,9 @@ def _access(host: str, key_file: Path | None, names: list[str]) -> "Access":
     # Imported here: only serving needs the web.
     from service.http.access import Access
 
+    for name in names:
+        if ":" in name or "/" in name:
+            raise UsageError(f"--name {name}: give the host's name alone, without scheme or port")
     others = reaches_others(host)
     if others and key_file is None:
         raise UsageError(

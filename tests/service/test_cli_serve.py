@@ -5,7 +5,11 @@ import os
 import socket
 
 import pytest
+from live_rig import options_for
 
+from canopy_skel.errors import UsageError
+from service.catalogue import Catalogue
+from service.compose import composed
 from service.server import listening
 
 
@@ -45,6 +49,15 @@ def test_an_address_of_another_machine_is_refused(canopy, tmp_path, host, why):
     assert len(stderr.splitlines()) == 1
 
 
+def test_a_folder_that_is_in_use_is_refused_before_arm_and_camera_are_touched(tmp_path):
+    def touched(options):
+        raise AssertionError("the hardware was touched")
+
+    busy = pytest.raises(UsageError, match="another canopy service uses this folder")
+    with Catalogue(tmp_path), busy, composed(options_for(tmp_path), touched):
+        pass
+
+
 def test_a_port_that_was_just_used_may_be_used_again():
     with listening("127.0.0.1", 0) as bound:
         address = bound.getsockname()
@@ -64,6 +77,7 @@ def test_a_port_that_was_just_used_may_be_used_again():
         (("--sim", "--host", "0.0.0.0"), "lets others reach the arm: give --key-file FILE"),
         (("--sim", "--host", "::"), "lets others reach the arm: give --key-file FILE"),
         (("--sim", "--key-file", "no-such-key"), "no key file no-such-key"),
+        (("--sim", "--name", "rig-3:8000"), "--name rig-3:8000: give the host's name alone"),
         (("--sim", "--port", "99999"), "less than or equal to 65535"),
         (("--sim", "--time-scale", "0"), "greater than or equal to 0.01"),
     ],
