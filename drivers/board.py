@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from canopy_skel.errors import UsageError
 from canopy_skel.frame import UInt8Array
 from canopy_skel.geometry import FloatArray
+from drivers.hand_eye import FEWEST_CORNERS
 
 Int32Array = NDArray[np.int32]
 
@@ -39,6 +40,12 @@ class Board:
         if not (2 < self.columns <= _MOST_SQUARES and 2 < self.rows <= _MOST_SQUARES):
             raise UsageError(
                 f"a board of {self.columns}x{self.rows} squares: give 3 to {_MOST_SQUARES} each"
+            )
+        corners = (self.columns - 1) * (self.rows - 1)
+        if corners < FEWEST_CORNERS:
+            raise UsageError(
+                f"a board of {self.columns}x{self.rows} squares has {corners} inner corners:"
+                f" {FEWEST_CORNERS} are needed"
             )
         if not 0 < self.marker_m < self.square_m < 1:
             raise UsageError(

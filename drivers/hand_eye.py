@@ -4,10 +4,13 @@ The solution is that of Park and Martin ("Robot sensor calibration: solving AX =
 Euclidean group", IEEE Transactions on Robotics and Automation, 1994), over all pairs of views.
 Moving it until the corners' pixels fit best makes it worse: errors of the arm's poses, not of the
 pixels, are what differs between views, and pixels hardly tell a tilt from a shift.
+
+The size of the board is one more unknown beside the translation: a board said 1 % too large puts
+the camera 5 mm wrong at half a metre, and views at one distance fit as well as before.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,12 +18,22 @@ from scipy.spatial.transform import Rotation
 
 from canopy_skel.errors import CanopyError
 from canopy_skel.frame import Intrinsics
-from canopy_skel.geometry import BoolArray, FloatArray, invert, transform_from, transform_points
+from canopy_skel.geometry import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    invert,
+    transform_from,
+    transform_points,
+)
 
 FEWEST_VIEWS = 6
 FEWEST_CORNERS = 6
 LEAST_TURN_DEG = 10.0
-_OUTLIER_PX, _OUTLIER_MEDIANS = 2.0, 4.0
+FITTING_PX = 2.0
+"""A view with a smaller residual fits the others; if most views have larger ones, none does."""
+_FITTING_MEDIANS = 4.0
+_SUBSETS, _SUBSET_VIEWS, _MOST_REFITS = 100, 4, 10
 
 
 class CalibrationError(CanopyError):
@@ -46,18 +59,27 @@ class BoardView:
 class HandEye:
     """The camera on the flange.
 
-    tool_from_camera, base_from_board: (4, 4). residual_px: (V,) of each view, how far its corners
-    are from where they should be (root mean square). used: (V,) which views it is made of; the
-    others fit none of the rest. position_std_m, turn_std_deg: how uncertain tool_from_camera is,
-    by leaving out one view after the other (jackknife); errors that all views share are not in it.
+    tool_from_camera, base_from_board: (4, 4). scale: how large the board is by the arm's motions,
+    1 as said. residual_px: (V,) of each view, how far the board's corners are from where they
+    should be (root mean square), those it does not show by where the others place them.
+    used: (V,) which views it is made of; the others do not fit these. position_std_m,
+    turn_std_deg, scale_std: how uncertain tool_from_camera and scale are, by leaving out one view
+    after the other (jackknife); errors that all views share are not in it.
     """
 
     tool_from_camera: FloatArray
     base_from_board: FloatArray
+    scale: float
     residual_px: FloatArray
     used: BoolArray
     position_std_m: float
     turn_std_deg: float
+    scale_std: float
+
+    @property
+    def middle_px(self) -> float:
+        """The residual that more than half of all views keep, used or not."""
+        return _middle(self.residual_px)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,12 +89,35 @@ class _Poses:
     base_from_tool0: FloatArray
     camera_from_board: FloatArray
 
-    def only(self, chosen: BoolArray) -> "_Poses":
+    def only(self, chosen: BoolArray | IntArray) -> "_Poses":
         return _Poses(self.base_from_tool0[chosen], self.camera_from_board[chosen])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Fit:
+    """tool_from_camera, base_from_board: (4, 4). scale: of the board, 1 as said."""
+
+    tool_from_camera: FloatArray
+    base_from_board: FloatArray
+    scale: float
+
+    def residuals_px(self, views: Sequence[BoardView]) -> FloatArray:
+        return np.array([self._residual_px(view) for view in views])
+
+    def _residual_px(self, view: BoardView) -> float:
+        base_from_camera = view.base_from_tool0 @ self.tool_from_camera
+        camera_from_board = invert(base_from_camera) @ self.base_from_board
+        corners = transform_points(camera_from_board, self.scale * view.corners_in_board)
+        if (corners[:, 2] <= 0).any():
+            return np.inf
+        away_px = np.linalg.norm(view.intrinsics.project(corners) - view.pixels, axis=1)
+        return float(np.sqrt(np.mean(away_px**2)))
 
 
 def calibrate(views: Sequence[BoardView]) -> HandEye:
     """Return where the camera is, from views with at least FEWEST_CORNERS corners each.
+
+    Up to a third of the views may be wrong; they are left out.
 
     Raises:
         CalibrationError: too few views, or the camera was hardly turned, or about one axis only.
@@ -82,29 +127,33 @@ def calibrate(views: Sequence[BoardView]) -> HandEye:
         np.array([view.base_from_tool0 for view in views]),
         np.array([_camera_from_board(view) for view in views]),
     )
-    used = np.ones(len(views), dtype=np.bool_)
-    while True:
-        _require_turns(poses.only(used))
-        tool_from_camera = _park_martin(poses.only(used))
-        base_from_board = _mean_board(poses.only(used), tool_from_camera)
-        residual_px = np.array(
-            [_residual_px(view, tool_from_camera, base_from_board) for view in views]
-        )
-        worst = int(np.argmax(np.where(used, residual_px, 0)))
-        if residual_px[worst] <= max(
-            _OUTLIER_PX, _OUTLIER_MEDIANS * float(np.median(residual_px[used]))
-        ):
+    _require_turns(poses)
+    board = np.unique(np.concatenate([view.corners_in_board for view in views]), axis=0)
+    whole = [
+        _completed(view, pose, board)
+        for view, pose in zip(views, poses.camera_from_board, strict=True)
+    ]
+    residual_px = _consensus_px(whole, poses)
+    used = np.zeros(len(views), dtype=np.bool_)
+    for _ in range(_MOST_REFITS):
+        fitting = _fitting(residual_px)
+        if (fitting == used).all():
             break
-        used[worst] = False
+        used = fitting
         _require_enough(int(used.sum()))
-    position_std_m, turn_std_deg = _jackknife(poses.only(used), tool_from_camera)
+        _require_turns(poses.only(used))
+        fit = _fit(poses.only(used))
+        residual_px = fit.residuals_px(whole)
+    position_std_m, turn_std_deg, scale_std = _jackknife(poses.only(used), fit)
     return HandEye(
-        tool_from_camera=tool_from_camera,
-        base_from_board=base_from_board,
+        tool_from_camera=fit.tool_from_camera,
+        base_from_board=fit.base_from_board,
+        scale=fit.scale,
         residual_px=residual_px,
         used=used,
         position_std_m=position_std_m,
         turn_std_deg=turn_std_deg,
+        scale_std=scale_std,
     )
 
 
@@ -148,6 +197,21 @@ def _camera_from_board(view: BoardView) -> FloatArray:
     return transform_from(Rotation.from_rotvec(turn[:, 0]).as_matrix(), shift[:, 0])
 
 
+def _completed(view: BoardView, camera_from_board: FloatArray, board: FloatArray) -> BoardView:
+    """Return the view with the rest of the board, (B, 3), where its own pose places it.
+
+    The few corners of a view can be where they should be while its pose is far from right.
+    """
+    seen = (board[:, None] == view.corners_in_board).all(axis=2).any(axis=1)
+    rest = board[~seen]
+    rest_px = view.intrinsics.project(transform_points(camera_from_board, rest))
+    return replace(
+        view,
+        corners_in_board=np.concatenate([view.corners_in_board, rest]),
+        pixels=np.concatenate([view.pixels, rest_px]),
+    )
+
+
 def _motions(poses: _Poses) -> tuple[FloatArray, FloatArray]:
     """Return A and B of AX = XB for all pairs of views: (P, 4, 4) each."""
     i, j = np.triu_indices(len(poses.base_from_tool0), k=1)
@@ -158,43 +222,72 @@ def _motions(poses: _Poses) -> tuple[FloatArray, FloatArray]:
     return a, b
 
 
-def _park_martin(poses: _Poses) -> FloatArray:
-    """Return tool_from_camera X, which fits AX = XB best over all pairs of views."""
+def _consensus_px(views: Sequence[BoardView], poses: _Poses) -> FloatArray:
+    """Return the (V,) residuals of the few views, chosen by lot, that most others agree with.
+
+    A fit to all would be drawn to views that are wrong together, as after the board was moved,
+    until none of them stands out.
+    """
+    rng = np.random.default_rng(0)
+    lots = (rng.choice(len(views), _SUBSET_VIEWS, replace=False) for _ in range(_SUBSETS))
+    return min((_fit(poses.only(lot)).residuals_px(views) for lot in lots), key=_middle)
+
+
+def _middle(residual_px: FloatArray) -> float:
+    """Return the upper median: half of the views agreeing is not enough."""
+    return float(np.sort(residual_px)[len(residual_px) // 2])
+
+
+def _fitting(residual_px: FloatArray) -> BoolArray:
+    """Return which of (V,) views fit the others: all, if most do not."""
+    middle_px = _middle(residual_px)
+    if middle_px > FITTING_PX:
+        return np.ones(len(residual_px), dtype=np.bool_)
+    fitting: BoolArray = residual_px <= max(FITTING_PX, _FITTING_MEDIANS * middle_px)
+    return fitting
+
+
+def _fit(poses: _Poses) -> _Fit:
+    """Return what fits AX = XB best over all pairs of views, and where the board is then."""
     a, b = _motions(poses)
-    turn, _ = Rotation.align_vectors(
-        Rotation.from_matrix(a[:, :3, :3]).as_rotvec(),
-        Rotation.from_matrix(b[:, :3, :3]).as_rotvec(),
-    )
-    left = (a[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = (turn.apply(b[:, :3, 3]) - a[:, :3, 3]).reshape(-1)
-    return transform_from(turn.as_matrix(), np.linalg.lstsq(left, right, rcond=None)[0])
+    turn = _park_martin_turn(a[:, :3, :3], b[:, :3, :3])
+    # (R_A - 1) t_X = scale R_X t_B - t_A; solved for scale - 1, which stays 0 if nothing tells it
+    board_m = b[:, :3, 3] @ turn.T
+    left = np.concatenate([a[:, :3, :3] - np.eye(3), -board_m[..., None]], axis=2).reshape(-1, 4)
+    found = np.linalg.lstsq(left, (board_m - a[:, :3, 3]).reshape(-1), rcond=None)[0]
+    tool_from_camera, scale = transform_from(turn, found[:3]), 1 + float(found[3])
+    return _Fit(tool_from_camera, _mean_board(poses, tool_from_camera, scale), scale)
 
 
-def _mean_board(poses: _Poses, tool_from_camera: FloatArray) -> FloatArray:
-    boards = poses.base_from_tool0 @ tool_from_camera @ poses.camera_from_board
+def _park_martin_turn(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the (3, 3) turn that takes the axes of the (P, 3, 3) turns b to those of a best."""
+    axes_a, axes_b = (Rotation.from_matrix(turns).as_rotvec() for turns in (a, b))
+    u, _, vt = np.linalg.svd(axes_a.T @ axes_b)
+    turn: FloatArray = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return turn
+
+
+def _mean_board(poses: _Poses, tool_from_camera: FloatArray, scale: float) -> FloatArray:
+    camera_from_board = poses.camera_from_board.copy()
+    camera_from_board[:, :3, 3] *= scale
+    boards = poses.base_from_tool0 @ tool_from_camera @ camera_from_board
     turn = Rotation.from_matrix(boards[:, :3, :3]).mean()
     return transform_from(turn.as_matrix(), boards[:, :3, 3].mean(axis=0))
 
 
-def _residual_px(
-    view: BoardView, tool_from_camera: FloatArray, base_from_board: FloatArray
-) -> float:
-    camera_from_board = invert(view.base_from_tool0 @ tool_from_camera) @ base_from_board
-    corners = transform_points(camera_from_board, view.corners_in_board)
-    if (corners[:, 2] <= 0).any():
-        return np.inf
-    away_px = np.linalg.norm(view.intrinsics.project(corners) - view.pixels, axis=1)
-    return float(np.sqrt(np.mean(away_px**2)))
+def _jackknife(poses: _Poses, fit: _Fit) -> tuple[float, float, float]:
+    """Return the standard deviations of place (m), turn (degrees) and scale of a fit.
 
-
-def _jackknife(poses: _Poses, tool_from_camera: FloatArray) -> tuple[float, float]:
-    """Return the standard deviation of tool_from_camera from results that lack one view each."""
+    They come from fits that lack one view each.
+    """
     count = len(poses.base_from_tool0)
-    without = [_park_martin(poses.only(np.arange(count) != left_out)) for left_out in range(count)]
-    shifts_m = np.array([one[:3, 3] for one in without])
-    turns = Rotation.from_matrix([tool_from_camera[:3, :3].T @ one[:3, :3] for one in without])
-    position_m, turn_rad = (
+    without = [_fit(poses.only(np.arange(count) != left_out)) for left_out in range(count)]
+    shifts_m = np.array([one.tool_from_camera[:3, 3] for one in without])
+    back = fit.tool_from_camera[:3, :3].T
+    turns = Rotation.from_matrix([back @ one.tool_from_camera[:3, :3] for one in without])
+    scales = np.array([[one.scale] for one in without])
+    position_m, turn_rad, scale = (
         float(np.sqrt((count - 1) * part.var(axis=0).sum()))
-        for part in (shifts_m, turns.as_rotvec())
+        for part in (shifts_m, turns.as_rotvec(), scales)
     )
-    return position_m, float(np.degrees(turn_rad))
+    return position_m, float(np.degrees(turn_rad)), scale

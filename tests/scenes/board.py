@@ -23,15 +23,18 @@ def mounted(rotation_vector, shift_m):
     return TOOL_FROM_CAMERA @ transform_from(turn, shift_m)
 
 
-def cameras(count, seed=1, rolled=0.7, spread_m=0.25):
-    """Return `base_from_camera` of cameras half a metre before the board, looking at it."""
+def cameras(count, seed=1, rolled=0.7, spread=0.5, distances_m=(0.35, 0.7)):
+    """Return `base_from_camera` of cameras before the board, looking at it.
+
+    `spread` is how far they are aside, per metre of distance.
+    """
     rng = np.random.default_rng(seed)
     poses = []
     for _ in range(count):
-        away = [-0.5, *rng.uniform(-spread_m, spread_m, 2)]
-        target = MIDDLE_M + rng.uniform(-0.03, 0.03, 3) * (spread_m > 0)
+        away = rng.uniform(*distances_m) * np.array([-1, *rng.uniform(-spread, spread, 2)])
+        target = MIDDLE_M + rng.uniform(-0.03, 0.03, 3) * (spread > 0)
         roll = Rotation.from_rotvec([0, 0, rng.uniform(-rolled, rolled)]).as_matrix()
-        poses.append(look_at(np.add(MIDDLE_M, away), target) @ transform_from(roll, np.zeros(3)))
+        poses.append(look_at(MIDDLE_M + away, target) @ transform_from(roll, np.zeros(3)))
     return poses
 
 
