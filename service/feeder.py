@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -13,10 +12,10 @@ import zenoh
 
 from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.messages import Message
-from canopy_skel.recording import Recording, messages_of_view, read_recording
 from service.bus import Keys
 from service.envelope import ViewEnvelope, encode_envelope
 from service.offered import Lacking, OfferedScan, OfferedView, ScanSource
+from service.recorded import RecordedViews
 from service.rig import PartStatus
 from service.skeleton_cache import SkeletonCache
 from service.worker_watch import WorkerSeen, WorkerWatch
@@ -64,7 +63,7 @@ class ViewFeeder:
         self._changed = threading.Condition()
         self._current: OfferedScan | None = None
         self._earlier: dict[str, OfferedScan] = {}  # in the order they are caught up on
-        self._recording: Recording | None = None  # the thread's alone
+        self._recorded = RecordedViews()
         self._asked_s = 0.0
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="view feeder", daemon=True)
@@ -99,6 +98,7 @@ class ViewFeeder:
             self._put_back(but=source.scan_id)
             self._skeletons.forget(source.scan_id)
             self._earlier.pop(source.scan_id, None)
+            self._recorded.forget()  # its recording is about to be replaced if it goes on
             self._current = OfferedScan(source=source)
             self._changed.notify_all()
 
@@ -258,8 +258,7 @@ class ViewFeeder:
     def _list(self, scan: OfferedScan) -> None:
         """Look up which views a recording has; one that cannot be read has none."""
         try:
-            self._recording = read_recording(scan.source.recording())
-            groups = self._recording.groups
+            groups = self._recorded.look_through(scan.source.recording()).groups
         except RecordingError as error:
             _log.warning("scan %s: no view of it is sent: %s", scan.source.scan_id, error)
             groups = ()
@@ -290,7 +289,7 @@ class ViewFeeder:
                 view=index,
                 config=source.config,
                 segmenter=source.segmenter,
-                messages=one.messages or self._recorded(source, index),
+                messages=one.messages or self._read(source, index),
             )
             # It may wait for seconds and lose the view even so: hence this thread, and the rest.
             self._session.put(
@@ -300,21 +299,15 @@ class ViewFeeder:
             )
         except (RecordingError, UsageError, zenoh.ZError) as error:
             _log.warning("scan %s: view %d is not sent yet: %s", source.scan_id, index, error)
-            self._recording = None
+            self._recorded.forget()
             one.put_off()
         else:
             one.mark_sent()
 
-    def _recorded(self, source: ScanSource, index: int) -> tuple[Message, ...]:
-        """Read a view from the recording, which is looked through anew only if need be."""
+    def _read(self, source: ScanSource, index: int) -> tuple[Message, ...]:
         try:
-            return self._read(source.recording(), index)
+            return self._recorded.messages(source.recording(), index)
         except RecordingError:
             # The scan may just have ended, which renames its recording.
-            return self._read(source.recording(), index)
-
-    def _read(self, path: Path, index: int) -> tuple[Message, ...]:
-        known = self._recording
-        if known is None or known.path != path or index not in {g.index for g in known.groups}:
-            known = self._recording = read_recording(path)
-        return messages_of_view(known, index)
+            self._recorded.forget()
+            return self._recorded.messages(source.recording(), index)

@@ -246,24 +246,36 @@ class MessageReader:
             raise RecordingError(f"{self._path}: changed while it was read ({error})") from error
 
     def _read(self, ref: MessageRef) -> bytes:
+        head_offset = ref.offset - _MESSAGE_HEAD.size
         if ref.chunk_offset is None:
             with open_recording(self._path) as stream:
-                stream.seek(ref.offset)
-                return stream.read(ref.size)
-        if ref.chunk_offset not in self._chunks:
+                stream.seek(head_offset)
+                head, data = stream.read(_MESSAGE_HEAD.size), stream.read(ref.size)
+        else:
+            chunk = self._chunk(ref.chunk_offset)
+            head, data = chunk[head_offset : ref.offset], chunk[ref.offset : ref.offset + ref.size]
+        if len(data) != ref.size or _MESSAGE_HEAD.unpack(head) != ref[:4]:
+            raise ValueError(f"another message is at byte {ref.offset}")
+        return data
+
+    def _chunk(self, offset: int) -> bytes:
+        if offset not in self._chunks:
             with open_recording(self._path) as stream:
-                chunk = Chunk.read(_fields(_record_at(stream, ref.chunk_offset)))
-            self._chunks[ref.chunk_offset] = bytes(_decompress(chunk))
+                chunk = Chunk.read(_fields(_record_at(stream, offset)))
+            self._chunks[offset] = bytes(_decompress(chunk))
             if len(self._chunks) > _CHUNKS_IN_MEMORY:
                 self._chunks.popitem(last=False)
-        self._chunks.move_to_end(ref.chunk_offset)
-        return self._chunks[ref.chunk_offset][ref.offset : ref.offset + ref.size]
+        self._chunks.move_to_end(offset)
+        return self._chunks[offset]
 
 
 def _record_at(stream: BinaryIO, offset: int) -> bytes:
     stream.seek(offset)
     _, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
-    return stream.read(length)
+    body = stream.read(length)
+    if len(body) != length:
+        raise ValueError(f"the record at byte {offset} is cut off")
+    return body
 
 
 def _records_in(data: memoryview) -> Iterator[tuple[int, int, int]]:

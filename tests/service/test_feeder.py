@@ -1,14 +1,19 @@
 """Scans that the workers do not get while they are under way; what they do get: test_worker."""
 
 from collections import Counter
+from contextlib import suppress
 from itertools import pairwise
 
 import pytest
 from scenes.bus import Rig, scan_views, wait_for
 
+from canopy_skel.document import from_json
+from canopy_skel.recording import RecordingWriter, carry_over
 from service.bus import scan_id_of
 from service.envelope import decode_envelope
 from service.heartbeat import decode_version
+from service.recorded import RecordedViews
+from service.scan import set_aside
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +31,13 @@ def rig(tmp_path):
 def record(rig, views, **changes):
     """Scan: begin, write views and offer them; return the id."""
     with rig.scan(**changes) as writer:
-        for view in views:
-            rig.feeder.offer(view.index, writer.write_view(view))
+        record_more(rig, writer, views)
     return rig.scan_id
+
+
+def record_more(rig, writer, views):
+    for view in views:
+        rig.feeder.offer(view.index, writer.write_view(view))
 
 
 def wait_for_skeleton(rig, name, timeout_s=30):
@@ -116,6 +125,48 @@ def test_a_scan_that_goes_on_again_is_no_earlier_one_any_more(rig, views):
     wait_for_skeleton(rig, rig.scan_id)
     wait_for(lambda: rig.caught_up)
     assert rig.caught_up == [(rig.scan_id, 2, [])]
+
+
+class PausedError(Exception):
+    pass
+
+
+def test_a_scan_that_goes_on_sends_no_view_from_where_it_was_in_the_file_before(rig, views):
+    worker = rig.start_ready_worker()
+    with suppress(PausedError), rig.scan() as writer:
+        for view in views[:3]:
+            writer.write_event(view.stamp_ns, {"kind": "view", "index": view.index})
+            writer.write_view(view)
+            rig.feeder.offer(view.index)  # to be read from the recording
+        assert rig.feeder.flush(20)
+        raise PausedError
+    worker.kill()
+    wait_for(lambda: not rig.feeder.worker_status().ready, 5)
+    source, path = rig.source(rig.scan_id), rig.folder / f"{rig.scan_id}.mcap"
+    rig.feeder.begin(source)
+    aside = set_aside(path)
+    with RecordingWriter(path, {"scan_id": rig.scan_id}) as writer:
+        for index in carry_over(aside, writer):
+            rig.feeder.offer(index)
+        aside.unlink()
+        rig.start_ready_worker()
+        assert rig.feeder.flush(20)
+        record_more(rig, writer, views[3:6])
+    assert rig.feeder.flush(20)
+    document = rig.feeder.latest_skeleton(rig.scan_id)
+    assert from_json(document).views_rejected == ()
+    assert document == rig.replayed()
+
+
+def test_a_view_is_read_from_the_file_that_has_the_name_now(tmp_path, views):
+    path, other, recorded = tmp_path / "scan.mcap", tmp_path / "other.mcap", RecordedViews()
+    for name, some in ((path, views[:3]), (other, views[1:4])):
+        with RecordingWriter(name, {}) as writer:
+            written = {view.index: writer.write_view(view) for view in some}
+    assert recorded.messages(path, 1) == written[1]
+    other.replace(path)
+    assert recorded.messages(path, 2) == written[2]
+    assert recorded.messages(path, 3) == written[3]
 
 
 def test_recordings_of_an_earlier_service_are_fed_after_the_scan_under_way(tmp_path, views):

@@ -122,6 +122,31 @@ def test_views_are_taken_from_a_file_that_is_being_written(kit, tmp_path):
     assert messages_of_view(read_recording(path), 2) == written[2]
 
 
+def test_a_file_that_was_replaced_gives_no_bytes_of_other_messages(kit, tmp_path):
+    path = tmp_path / "scan.mcap"
+    with RecordingWriter(path, {}, tool_from_camera=kit.tool_from_camera) as writer:
+        written = [writer.write_view(kit.make_view(index)) for index in range(2)]
+    known = read_recording(path)
+    path.unlink()
+    with RecordingWriter(path, {}) as writer:
+        writer.write_event(1, {"kind": "running"})
+        writer.write_messages(written[0])
+    for index in range(2):
+        with pytest.raises(RecordingError, match="changed while it was read"):
+            messages_of_view(known, index)
+
+
+@pytest.mark.parametrize("options", [{"use_chunking": False}, {"chunk_size": 1}])
+def test_a_file_that_was_cut_since_gives_no_short_messages(kit, tmp_path, options):
+    messages = kit.messages_of(kit.make_view(0)).values()
+    path = kit.write_raw(tmp_path / "scan.mcap", [*messages], **options)
+    known = read_recording(path)
+    last = max(known.file.messages, key=lambda ref: (ref.chunk_offset or 0, ref.offset))
+    path.write_bytes(path.read_bytes()[: (last.chunk_offset or last.offset) + 20])
+    with pytest.raises(RecordingError, match="changed while it was read"):
+        messages_of_view(known, 0)
+
+
 def test_a_view_that_was_cut_is_not_handed_out(kit, tmp_path):
     whole, cut = kit.messages_of(kit.make_view(0)), kit.messages_of(kit.make_view(1))
     del cut["/camera/depth/image"]
