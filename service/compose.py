@@ -33,6 +33,7 @@ from service.http.access import Access
 from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
 from service.offered import ScanSource
+from service.pictures import recorded_file
 from service.rig import CAUGHT_UP, PartStatus, ScanSpec
 from service.rig_file import WATCHDOG_HZ, RigFile
 from service.scan import Attachments, Stage
@@ -123,12 +124,11 @@ class BusFeed:
 
 
 def _source(spec: ScanSpec, path: Path) -> ScanSource:
-    part = path.with_name(path.name + ".part")
     return ScanSource(
         scan_id=spec.scan_id,
         config=spec.config,
         segmenter=spec.segmenter,
-        recording=lambda: path if path.exists() else part,
+        recording=lambda: recorded_file(path) or path,
     )
 
 

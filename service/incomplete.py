@@ -57,4 +57,6 @@ def _was_caught_up(catalogue: Catalogue, record: ScanRecord) -> bool:
         for event in catalogue.events(record.scan_id, after=0)
         if event.kind == CAUGHT_UP and event.data["views_done"] >= record.views_done
     ]
-    return len(ends) >= MOST_FAILURES or any(end["views"] and not end["refused"] for end in ends)
+    return len(ends) >= MOST_FAILURES or any(
+        end["views"] >= record.views_done and not end["refused"] for end in ends
+    )

@@ -8,11 +8,14 @@ import pytest
 from scenes.bus import Rig, scan_views, wait_for
 
 from canopy_skel.document import from_json
+from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter, carry_over
 from service.bus import scan_id_of
+from service.compose import BusFeed
 from service.envelope import decode_envelope
 from service.heartbeat import decode_version
 from service.recorded import RecordedViews
+from service.rig import ScanSpec
 from service.scan import set_aside
 
 
@@ -125,6 +128,19 @@ def test_a_scan_that_goes_on_again_is_no_earlier_one_any_more(rig, views):
     wait_for_skeleton(rig, rig.scan_id)
     wait_for(lambda: rig.caught_up)
     assert rig.caught_up == [(rig.scan_id, 2, [])]
+
+
+def test_what_was_set_aside_is_caught_up_on_and_not_its_half_copy(rig, views):
+    path = rig.folder / "scan.mcap"
+    for suffix, some in ((".aside", views), (".part", views[:2])):
+        with RecordingWriter(path.with_name(path.name + suffix), {}) as writer:
+            for view in some:
+                writer.write_view(view)
+    spec = ScanSpec(scan_id="scan", tree_id="t", waypoints=(), config=MethodConfig())
+    BusFeed(rig.feeder).catch_up(spec, path)
+    rig.start_ready_worker()
+    wait_for(lambda: rig.caught_up)
+    assert rig.caught_up == [("scan", 10, [])]
 
 
 class PausedError(Exception):

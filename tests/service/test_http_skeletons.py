@@ -200,7 +200,12 @@ def test_scans_without_the_skeleton_of_all_their_views_are_caught_up_on_by_the_n
 
 @pytest.mark.parametrize(
     ("end", "times"),
-    [({"views": 3, "refused": []}, 1), ({"views": 3, "refused": [1]}, 3), ({"views": 0}, 3)],
+    [
+        ({"views": 3, "refused": []}, 1),
+        ({"views": 3, "refused": [1]}, 3),
+        ({"views": 2}, 3),
+        ({"views": 0}, 3),
+    ],
 )
 def test_a_recording_that_gives_no_whole_skeleton_is_not_fed_for_ever(tmp_path, end, times):
     with serving(tmp_path) as live:
