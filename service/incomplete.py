@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 
 from canopy_skel.errors import UsageError
 from service.catalogue import Catalogue, RevisionRecord, ScanRecord
-from service.rig import CAUGHT_UP, ScanSpec
+from service.rig import CAUGHT_UP, RigError, ScanSpec
 from service.specs import spec_from
 
 LOOK_BACK = 200
@@ -29,7 +29,7 @@ def incomplete(catalogue: Catalogue, interrupted: Collection[str]) -> Iterator[S
             continue
         try:
             yield spec_from(record.scan_id, record.request)
-        except (KeyError, TypeError, ValueError, UsageError) as error:
+        except (KeyError, TypeError, ValueError, UsageError, RigError) as error:
             _log.warning("scan %s: its request cannot be read (%r)", record.scan_id, error)
 
 

@@ -26,11 +26,6 @@ CAUGHT_UP = "caught_up"
 """The kind of event that says: nothing more of an earlier scan will be fed to a worker."""
 
 
-SLOWEST_MPS = 0.005
-GENTLEST_MPS2 = 0.01
-"""Below these a move across the workspace would take longer than anybody watches it."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class ScanSpec:
     """What to scan and how.
@@ -38,9 +33,6 @@ class ScanSpec:
     waypoints: base_from_tool0 (4, 4) of each exposure, in order. speed_mps,
     acceleration_mps2: of the flange between them. settle_timeout_s: for coming to rest, beyond
     what the move itself may take. retakes: further tries for a bad picture.
-
-    Raises:
-        PlanRefusedError: it is too slow to be meant.
     """
 
     scan_id: str
@@ -53,11 +45,6 @@ class ScanSpec:
     settle_timeout_s: float = 20.0
     grab_timeout_s: float = 10.0
     retakes: int = 2
-
-    def __post_init__(self) -> None:
-        """Check the speeds: how long a move is waited for follows from them."""
-        _require_at_least(SLOWEST_MPS, speed_mps=self.speed_mps)
-        _require_at_least(GENTLEST_MPS2, acceleration_mps2=self.acceleration_mps2)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -191,9 +178,3 @@ class Rig(Protocol):
     def subscribe(self, listener: Callable[[RigEvent], None]) -> None:
         """Call `listener` for every event, from any thread; it must return at once."""
         ...
-
-
-def _require_at_least(least: float, **values: float) -> None:
-    for name, value in values.items():
-        if not value >= least:
-            raise PlanRefusedError(f"{name} {value:g} is under {least:g}; ask for more")

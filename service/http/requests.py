@@ -14,10 +14,14 @@ from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.geometry import FloatArray
 from canopy_skel.pipeline import DEFAULT_METHOD, MethodConfig, MethodName
 from service.pose_fields import Fields, Pose, Positive
-from service.rig import GENTLEST_MPS2, SLOWEST_MPS, PlanRefusedError, ScanSpec
+from service.rig import PlanRefusedError, ScanSpec
 from service.specs import method_config
 
 MOST_WAYPOINTS = 1000
+SLOWEST_MPS = 0.005
+GENTLEST_MPS2 = 0.01
+"""Below these a move across the workspace would take longer than anybody watches it. Scans of
+before there were such bounds are gone on with as they were asked for."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,10 +121,13 @@ def plan_spec(
         tree_id="",
         waypoints=_waypoints(body, paths),
         config=MethodConfig(),
-        speed_mps=_capped("speed_mps", body.speed_mps, caps.speed_mps, usual.speed_mps),
-        acceleration_mps2=_capped(
+        speed_mps=_within(
+            "speed_mps", body.speed_mps, SLOWEST_MPS, caps.speed_mps, usual.speed_mps
+        ),
+        acceleration_mps2=_within(
             "acceleration_mps2",
             body.acceleration_mps2,
+            GENTLEST_MPS2,
             caps.acceleration_mps2,
             usual.acceleration_mps2,
         ),
@@ -157,9 +164,10 @@ def _waypoints(body: PlanBody, paths: Mapping[str, Sequence[ArrayLike]]) -> tupl
     return tuple(np.array(pose, dtype=np.float64) for pose in paths[body.path])
 
 
-def _capped(name: str, asked: float | None, cap: float, default: float) -> float:
-    if asked is None:
-        return min(cap, default)
-    if asked > cap:
-        raise PlanRefusedError(f"{name} {asked:g} is over the cap of {cap:g}; ask for less")
-    return asked
+def _within(name: str, asked: float | None, least: float, cap: float, default: float) -> float:
+    value = min(cap, default) if asked is None else asked
+    if value > cap:
+        raise PlanRefusedError(f"{name} {value:g} is over the cap of {cap:g}; ask for less")
+    if value < least:
+        raise PlanRefusedError(f"{name} {value:g} is under {least:g}; ask for more")
+    return value

@@ -2,10 +2,11 @@
 
 import json
 import socket
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 
 import httpx2
@@ -59,6 +60,17 @@ def serving(
             server.handle_exit(0, None)
             thread.join(10)
         assert not thread.is_alive()
+
+
+def ask_again(folder, scan_id: str, **changes: object):
+    """Change what a scan of the catalogue was asked for, as another version may have noted it."""
+    with closing(sqlite3.connect(folder / "catalogue.sqlite")) as catalogue:
+        for name, value in changes.items():
+            catalogue.execute(
+                "UPDATE scans SET request = json_set(request, ?, ?) WHERE scan_id = ?",
+                [f"$.{name}", value, scan_id],
+            )
+        catalogue.commit()
 
 
 def wait_until(condition, timeout_s: float = 5.0):

@@ -9,7 +9,7 @@ import httpx2
 import numpy as np
 import pytest
 from fake_rig import FakeRig
-from live_service import BODY, PATHS, problem, serving, wait_until
+from live_service import BODY, PATHS, ask_again, problem, serving, wait_until
 
 from service.http.requests import SpeedCaps
 from service.rig import RigNotReadyError, ScanState
@@ -490,6 +490,15 @@ def test_a_scan_of_an_earlier_life_waits_for_an_operator_and_goes_on(tmp_path):
         [spec] = live.rig.specs
         assert (spec.scan_id, spec.speed_mps) == (first.scan_id, first.speed_mps)
         assert all((a == b).all() for a, b in zip(spec.waypoints, first.waypoints, strict=True))
+
+
+def test_a_scan_of_an_earlier_life_goes_on_as_slowly_as_it_was_asked_for_then(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+    ask_again(tmp_path, scan_id, speed_mps=0.004)
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.http.post(f"/v1/scans/{scan_id}:resume").status_code == 200
+        assert [spec.speed_mps for spec in live.rig.specs] == [0.004]
 
 
 def test_a_scan_of_an_earlier_life_can_be_cancelled(tmp_path):

@@ -12,7 +12,7 @@ import httpx2
 import numpy as np
 import pytest
 from fake_rig import DEMO_RECORDING, FakeRig
-from live_service import problem, serving, skeleton, wait_until
+from live_service import ask_again, problem, serving, skeleton, wait_until
 
 from canopy_skel.document import from_json
 from canopy_skel.exports import FORMATS
@@ -20,7 +20,8 @@ from canopy_skel.recording import read_recording
 from canopy_skel.schema import schema_text
 from service.http.negotiation import best_media_type, wait_s
 from service.http.skeletons import MEDIA_TYPES
-from service.rig import CAUGHT_UP
+from service.rig import CAUGHT_UP, PlanRefusedError
+from service.specs import spec_from
 
 
 def with_two_revisions(live):
@@ -228,6 +229,24 @@ def test_a_request_that_cannot_be_read_any_more_does_not_keep_the_service_from_s
         catalogue.commit()
     with serving(tmp_path, FakeRig()) as live:
         assert to_catch_up(live) == [good]
+
+
+@pytest.mark.parametrize("refusal", [None, PlanRefusedError("too slow to be meant")])
+def test_a_scan_asked_for_under_other_bounds_keeps_no_other_from_being_caught_up_on(
+    tmp_path, monkeypatch, refusal
+):
+    with serving(tmp_path) as live:
+        slow, usual = finished(live, "k1"), finished(live, "k2")
+    ask_again(tmp_path, slow, speed_mps=0.004, acceleration_mps2=0.001)
+
+    def read(scan_id, fields):
+        if refusal is not None and scan_id == slow:
+            raise refusal
+        return spec_from(scan_id, fields)
+
+    monkeypatch.setattr("service.incomplete.spec_from", read)
+    with serving(tmp_path, FakeRig()) as live:
+        assert to_catch_up(live) == ([slow, usual] if refusal is None else [usual])
 
 
 def test_the_schema_is_served(idle):
