@@ -70,7 +70,11 @@ class WaypointVerdict:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RigEvent:
-    """Something that happened, for operators and the journal. kind: short, e.g. "view"."""
+    """Something that happened, for operators and the journal. kind: short, e.g. "view".
+
+    A scan that ended badly by itself is told with a `detail` that says why, which is also why the
+    arm is held; one that an operator stopped is told without.
+    """
 
     scan_id: str
     kind: str

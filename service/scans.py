@@ -51,7 +51,7 @@ class Scans:
         self.catalogue = catalogue
         self._rig = rig
         self._bell = bell
-        self._events: SimpleQueue[RigEvent | None] = SimpleQueue()
+        self._events: SimpleQueue[RigEvent | Event | None] = SimpleQueue()
         self._starting = Lock()
         self._refreshing = Lock()
         self._journal = Thread(target=self._write_journal, name="journal", daemon=True)
@@ -177,6 +177,7 @@ class Scans:
 
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again, and forget the stops until now. Raises RigNotReadyError."""
+        self._catch_up_journal()  # a stop that is noted later would count as one after this
         last = self.catalogue.last_stop()  # one during the acknowledgement wants its own
         self._rig.acknowledge(reason)
         try:
@@ -277,8 +278,18 @@ class Scans:
                 return
             self._rig.catch_up(spec)
 
+    def _catch_up_journal(self) -> None:
+        """Wait until what the rig has told so far is noted, but not for long."""
+        noted = Event()
+        self._events.put(noted)
+        if not noted.wait(_JOURNAL_TIMEOUT_S):
+            logger.warning("the journal lags behind; a stop may need another acknowledgement")
+
     def _write_journal(self) -> None:
         while (event := self._events.get()) is not None:
+            if isinstance(event, Event):
+                event.set()
+                continue
             try:
                 self._note(event)
             except Exception:
@@ -294,7 +305,9 @@ class Scans:
         if self.catalogue.scan(event.scan_id) is None:
             logger.info("event of no scan kind=%s fields=%s", event.kind, dict(event.fields))
             return
-        if event.kind in _HOLDING:  # noted apart from the scan, which may be cancelled by then
+        # Noted apart from the scan, which may be cancelled by then. Without a detail it is what
+        # comes of an operator's stop: `stop` has noted that, and it may be acknowledged by now.
+        if event.kind in _HOLDING and event.fields.get("detail"):
             self.catalogue.add_stop()
         skeleton = self._rig.skeleton(event.scan_id)
         if skeleton is not None:

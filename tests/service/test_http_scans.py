@@ -314,12 +314,37 @@ def test_a_scan_that_ended_badly_holds_the_arm_beyond_its_own_end_and_the_servic
     with serving(tmp_path) as live:
         scan_id = live.start()
         live.rig.become(scan_id, state=state, detail="something unheard of")
-        live.rig.tell(scan_id, state.value)
+        live.rig.tell(scan_id, state.value, detail="something unheard of")
         wait_until(lambda: live.http.get("/v1/scans").json()["scans"][0]["state"] == state)
         live.http.post(f"/v1/scans/{scan_id}:cancel")
     with serving(tmp_path, FakeRig()) as live:
         assert live.rig.holds == ["the arm was stopped before the service was started again"]
         live.http.post("/v1/rig:acknowledge", json={"reason": "looked"})
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.holds == []
+
+
+def test_the_end_of_a_scan_that_an_operator_stopped_needs_no_second_acknowledgement(tmp_path):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        live.http.post("/v1/rig:stop")
+        assert acknowledged(live).status_code == 200
+        live.rig.become(scan_id, state=ScanState.STOPPED)
+        live.rig.tell(scan_id, "stopped")
+        live.http.post(f"/v1/scans/{scan_id}:cancel")
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.rig.holds == []
+
+
+def test_a_bad_end_that_is_noted_late_is_acknowledged_too(tmp_path, monkeypatch):
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        monkeypatch.setattr(live.rig, "skeleton", lambda scan_id: time.sleep(0.2))
+        live.rig.photograph(scan_id, 0)  # holds the journal up
+        live.rig.become(scan_id, state=ScanState.STOPPED, detail="the camera is gone")
+        live.rig.tell(scan_id, "stopped", detail="the camera is gone")
+        assert acknowledged(live).status_code == 200
+        live.http.post(f"/v1/scans/{scan_id}:cancel")
     with serving(tmp_path, FakeRig()) as live:
         assert live.rig.holds == []
 
