@@ -17,8 +17,8 @@ from canopy_skel.geometry import FloatArray
 from drivers import guarded_arm
 from drivers.oak.messages import OakConfig
 from drivers.ur5.messages import Ur5Config
+from service.http.requests import GENTLEST_MPS2, SLOWEST_MPS
 from service.pose_fields import Fields, Finite, Pose, Positive
-from service.rig import GENTLEST_MPS2, SLOWEST_MPS
 
 UR5_PAYLOAD_KG = 5.0
 WATCHDOG_HZ = 2.0
