@@ -59,6 +59,7 @@ class Calibration:
             doubts.append(
                 f"the board's squares seem to be {1e3 * self.square_m * found.scale:.2f} mm, not"
                 f" {1e3 * self.square_m:.2f}: measure across the whole board and divide"
+                "; if that is right, the focal length is as wrong"
             )
         if found.position_std_m > MOST_STD_M or found.turn_std_deg > MOST_STD_DEG:
             doubts.append(
