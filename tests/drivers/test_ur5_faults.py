@@ -258,7 +258,7 @@ def test_frozen_controller(fake, moving):
 
 
 def test_slow_packets_delay_the_state_but_are_no_fault(fake, arm):
-    fake.do("slow_packets", period_s=0.15)
+    fake.do("slow_packets", period_s=0.1)
     target = down(arm.state(), 0.05)
     arm.start_move(linear(target))
     end = wait_settled(arm, timeout_s=5.0)
