@@ -216,6 +216,16 @@ class FoxgloveDecoder:
         return decode_scores(data)
 
 
+def exposure_stamp_ns(picture: Message) -> int:
+    """Return when a picture was taken: what its header says, else when it was recorded.
+
+    Raises:
+        ValueError: the bytes are no image message.
+    """
+    message_class = cast(type[CompressedImage | RawImage], TOPICS[picture.topic].message_class)
+    return _parse(message_class, picture.data).timestamp.ToNanoseconds() or picture.stamp_ns
+
+
 def decode_scores(data: bytes | str) -> tuple[float, ...]:
     """Return s1, s2, … of {"scores": [s1, s2, …]}.
 

@@ -92,11 +92,10 @@ def view_from_messages(messages: Sequence[Message], options: TopicOptions = _CAN
         role = options.role_of(message.topic)
         if role is None or message.topic not in TOPICS:
             continue
-        part = _part(message)
         if role == "transforms":
-            transforms.extend(_transforms(part, decoder))
+            transforms.extend(stamped_transforms(message))
         else:
-            parts.setdefault(role, part)
+            parts.setdefault(role, _part(message))
     return decode_view(
         indices[0],
         parts,
@@ -119,13 +118,13 @@ def _part(message: Message) -> Part:
     )
 
 
-def _transforms(part: Part, decoder: Decoder) -> list[StampedTransform]:
+def stamped_transforms(message: Message) -> list[StampedTransform]:
     """Return the transforms of a message; none of bytes that are no message, as readers do."""
     try:
-        decoded = decoder.transforms(part.schema, part.data)
+        decoded = FoxgloveDecoder().transforms(TOPICS[message.topic].schema, message.data)
     except ValueError:
         return []  # the pose is looked up next, and missed by name
-    return [one if one.stamp_ns else replace(one, stamp_ns=part.log_time_ns) for one in decoded]
+    return [one if one.stamp_ns else replace(one, stamp_ns=message.stamp_ns) for one in decoded]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -58,6 +59,26 @@ class TransformBuffer:
             on_tool = on_tool or here == self._tool_frame
             target_from_frame = target_from_frame @ self._step(here, there, stamp_ns, on_tool)
         return target_from_frame
+
+    def around(self, stamp_ns: int) -> list[StampedTransform]:
+        """Return the transforms that a lookup at a time goes by: of each edge those next to it.
+
+        Of an edge published as static the value of that time, so that it holds without the role.
+        """
+        return [
+            replace(one, stamp_ns=stamp_ns) if edge in self._static else one
+            for edge, samples in self._samples.items()
+            for one in self._next_to(edge, samples, stamp_ns)
+        ]
+
+    def _next_to(
+        self, edge: _Edge, samples: list[StampedTransform], stamp_ns: int
+    ) -> list[StampedTransform]:
+        after = bisect_left(samples, stamp_ns, key=_stamp)
+        latest = max(bisect_right(samples, stamp_ns, key=_stamp) - 1, 0)
+        if edge in self._static:
+            return [samples[latest]]
+        return [samples[i] for i in sorted({latest, min(after, len(samples) - 1)})]
 
     def _path(self, target: str, source: str) -> list[str]:
         """Return the frames of the shortest chain from target to source."""

@@ -47,6 +47,24 @@ def test_messages_alone_give_the_view_of_the_recording(kit, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["apple_dense", "walnut_stereo"])
+def test_a_view_stands_alone_where_the_recording_says_some_things_once(
+    kit, shared_recording, tmp_path, name
+):
+    """These say the hand-eye transform with the first view only; now the calibrations, too."""
+    recording = read_recording(shared_recording(name))
+    messages = [
+        message
+        for group in recording.groups
+        for message in messages_of_view(recording, group.index)
+        if group.index == 0 or "calibration" not in message.topic
+    ]
+    once = read_recording(kit.write_raw(tmp_path / "once.mcap", messages))
+    for view in islice(recording.views(), 3):
+        for source in (recording, once):
+            assert_identical(view_from_messages(messages_of_view(source, view.index)), view)
+
+
+@pytest.mark.parametrize("name", ["apple_dense", "walnut_stereo"])
 def test_orchard_views_are_the_same_either_way(shared_recording, tmp_path, name):
     path = tmp_path / "again.mcap"
     with RecordingWriter(path, {}) as writer:

@@ -130,3 +130,27 @@ def test_unconnected_frames_are_named():
 
 def test_a_frame_in_itself_is_the_identity():
     np.testing.assert_array_equal(buffer().lookup("base", "base", 5), np.eye(4))
+
+
+stamps = st.integers(0, 8).map(lambda tick: 50 * MS * tick)
+
+
+@given(
+    st.lists(stamps.flatmap(lambda stamp: poses(stamp_ns=stamp)), max_size=4),
+    st.lists(stamps.flatmap(lambda s: poses("tool0", "camera", stamp_ns=s)), max_size=4),
+    st.lists(stamps.flatmap(lambda s: poses("camera", "eye", stamp_ns=s)), max_size=2),
+    st.integers(0, 450 * MS),
+)
+def test_what_lies_around_a_time_is_all_that_a_lookup_needs(arm, mount, eye, stamp_ns):
+    whole = buffer(*arm, *mount, static=eye)
+    around = buffer(*whole.around(stamp_ns))
+    assert len(whole.around(stamp_ns)) <= 5
+    for target, source in (("base", "camera"), ("eye", "base"), ("base", "tool0")):
+        assert found(around, target, source, stamp_ns) == found(whole, target, source, stamp_ns)
+
+
+def found(transforms, target, source, stamp_ns):
+    try:
+        return transforms.lookup(target, source, stamp_ns).tolist()
+    except ValueError:
+        return None
