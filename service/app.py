@@ -14,6 +14,7 @@ from service.bell import Bell
 from service.catalogue import Catalogue
 from service.http import metrics as metric_routes
 from service.http import planners as planner_routes
+from service.http import replays as replay_routes
 from service.http import rig as rig_routes
 from service.http import scans as scan_routes
 from service.http import skeletons as skeleton_routes
@@ -70,11 +71,19 @@ def create_app(
         paths=paths,
         caps=caps or SpeedCaps(),
         segmenter=segmenter,
+        uploads=catalogue.uploads,
     )
     app.state.access = access or Access()
     add_handlers(app)
     app.include_router(rig_routes.stop_router)
-    routes = (rig_routes, metric_routes, scan_routes, planner_routes, skeleton_routes)
+    routes = (
+        rig_routes,
+        metric_routes,
+        scan_routes,
+        replay_routes,
+        planner_routes,
+        skeleton_routes,
+    )
     for router in (_page, *(module.router for module in routes)):
         app.include_router(router, dependencies=[Depends(refuse_unknown_names)])
     app.mount("/console", StaticFiles(packages=[("service", "console")]))

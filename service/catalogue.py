@@ -23,7 +23,7 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 
 from canopy_skel.errors import UsageError
 from service.outputs import require_writable
-from service.rig import FINISHED, ScanState, ScanStatus
+from service.rig import FINISHED, ScanKind, ScanState, ScanStatus
 from service.tables import EVENTS, IDEMPOTENCY, REVISIONS, SCANS, STOPS
 
 KEY_LIFETIME_NS = 24 * 3600 * 10**9
@@ -37,7 +37,7 @@ _BUSY_TIMEOUT_MS = 5000
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ScanRecord:
-    """A scan as the catalogue knows it. request: see `service.specs.fields_of`."""
+    """A scan or replay as the catalogue knows it. request: see `service.specs.fields_of`."""
 
     scan_id: str
     tree_id: str
@@ -49,6 +49,7 @@ class ScanRecord:
     recording: Path | None
     created_ns: int
     updated_ns: int
+    kind: ScanKind
 
     @property
     def status(self) -> ScanStatus:
@@ -90,6 +91,11 @@ class Catalogue:
         self._folder = Path(folder)
         self._blobs = self._folder / "skeletons"
 
+    @property
+    def uploads(self) -> Path:
+        """Folder of what is being received; emptied by `recover`."""
+        return self._folder / "uploads"
+
     def __enter__(self) -> Self:
         """Take the folder for this process and bring the schema up to date.
 
@@ -97,6 +103,7 @@ class Catalogue:
             UsageError: another process has it open, or it cannot be written.
         """
         require_writable(self._blobs)
+        self.uploads.mkdir(exist_ok=True)
         self._lock = _locked(self._folder / "catalogue.lock")
         self._engine = sa.create_engine(f"sqlite:///{self._folder / 'catalogue.sqlite'}")
         sa.event.listen(self._engine, "connect", _set_pragmas)
@@ -124,9 +131,11 @@ class Catalogue:
     def recover(self) -> list[str]:
         """Put right what a killed service left; return the scans that were under way then.
 
-        They become STOPPED: their motion is over, and only an operator may have it go on.
+        They become STOPPED: their motion is over, and only an operator may have it go on. Replays
+        go on by themselves.
         """
-        under_way = SCANS.c.state.in_([ScanState.RUNNING, ScanState.PAUSED])
+        moving = SCANS.c.state.in_([ScanState.RUNNING, ScanState.PAUSED])
+        under_way = moving & (SCANS.c.kind == ScanKind.SCAN)
         with self.transaction() as connection:
             left = connection.scalars(sa.select(SCANS.c.scan_id).where(under_way)).all()
             connection.execute(
@@ -142,7 +151,7 @@ class Catalogue:
                     connection.execute(
                         REVISIONS.delete().where(_is_revision(row.scan_id, row.revision))
                     )
-        for file in set(self._blobs.iterdir()) - named:
+        for file in (set(self._blobs.iterdir()) - named).union(self.uploads.iterdir()):
             file.unlink()
         return list(left)
 
@@ -165,11 +174,12 @@ class Catalogue:
         self,
         status: ScanStatus,
         request: Mapping[str, Any],
-        key: str,
+        key: str | None,
         body_sha256: str,
         response: Mapping[str, Any],
+        kind: ScanKind = ScanKind.SCAN,
     ) -> None:
-        """Note a scan that is about to start, the key that asked for it, and the answer."""
+        """Note a scan that is about to start, the key (if any) that asked for it, the answer."""
         now_ns = time.time_ns()
         with self.transaction() as connection:
             connection.execute(
@@ -177,9 +187,15 @@ class Catalogue:
             )
             connection.execute(
                 SCANS.insert().values(
-                    **_status_values(status), request=request, created_ns=now_ns, updated_ns=now_ns
+                    **_status_values(status),
+                    request=request,
+                    created_ns=now_ns,
+                    updated_ns=now_ns,
+                    kind=kind,
                 )
             )
+            if key is None:
+                return
             connection.execute(
                 IDEMPOTENCY.insert().values(
                     key=key,
@@ -232,22 +248,24 @@ class Catalogue:
         with self.transaction() as connection:
             return [_scan_record(row) for row in connection.execute(query.limit(limit))]
 
-    def count_scans(self) -> dict[str, int]:
-        """Return how many scans are in each state."""
-        return self._counts(SCANS.c.state)
+    def count_scans(self, kind: ScanKind) -> dict[str, int]:
+        """Return how many scans, or replays, are in each state."""
+        return self._counts(SCANS.c.state, SCANS.c.kind == kind)
 
     def count_events(self) -> dict[str, int]:
         """Return how many events of each kind there were."""
-        return self._counts(EVENTS.c.kind)
+        return self._counts(EVENTS.c.kind, sa.true())
 
-    def _counts(self, column: sa.Column[str]) -> dict[str, int]:
+    def _counts(self, column: sa.Column[str], of: sa.ColumnElement[bool]) -> dict[str, int]:
+        query = sa.select(column, sa.func.count()).where(of).group_by(column)
         with self.transaction() as connection:
-            rows = connection.execute(sa.select(column, sa.func.count()).group_by(column))
+            rows = connection.execute(query)
             return {str(row[0]): int(row[1]) for row in rows}
 
-    def unfinished(self) -> list[ScanRecord]:
-        """Return the scans that can still go on, newest first."""
-        query = sa.select(SCANS).where(SCANS.c.state.not_in(FINISHED))
+    def unfinished(self, kind: ScanKind = ScanKind.SCAN) -> list[ScanRecord]:
+        """Return the scans, or replays, that can still go on, newest first."""
+        going = SCANS.c.state.not_in(FINISHED) & (SCANS.c.kind == kind)
+        query = sa.select(SCANS).where(going)
         with self.transaction() as connection:
             rows = connection.execute(query.order_by(SCANS.c.created_ns.desc()))
             return [_scan_record(row) for row in rows]
@@ -355,5 +373,5 @@ def _status_values(status: ScanStatus) -> dict[str, Any]:
 def _scan_record(row: sa.Row[Any]) -> ScanRecord:
     fields = dict(row._mapping)  # noqa: SLF001  # SQLAlchemy's public name for it
     recording = fields.pop("recording")
-    fields["state"] = ScanState(fields["state"])
+    fields["state"], fields["kind"] = ScanState(fields["state"]), ScanKind(fields["kind"])
     return ScanRecord(**fields, recording=Path(recording) if recording else None)

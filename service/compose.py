@@ -106,6 +106,10 @@ class BusFeed:
         """Have the views of a recording sent that has ended before."""
         self._feeder.catch_up(_source(spec, path))
 
+    def leave(self, scan_id: str) -> None:
+        """Have no more views of such a recording sent."""
+        self._feeder.leave(scan_id)
+
     def offer(self, scan_id: str, index: int) -> None:
         """Have a recorded view sent."""
         self._feeder.offer(index)

@@ -117,6 +117,11 @@ class ViewFeeder:
                 self._earlier.setdefault(source.scan_id, scan)
                 self._changed.notify_all()
 
+    def leave(self, scan_id: str) -> None:
+        """Send nothing more of an earlier scan, and say nothing more of it."""
+        with self._changed:
+            self._earlier.pop(scan_id, None)
+
     def offer(self, index: int, messages: Sequence[Message] = ()) -> None:
         """Say that a view of the scan under way is in the recording; returns at once.
 

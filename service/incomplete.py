@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 
 from canopy_skel.errors import UsageError
 from service.catalogue import Catalogue, RevisionRecord, ScanRecord
-from service.rig import CAUGHT_UP, RigError, ScanSpec
+from service.rig import CAUGHT_UP, RigError, ScanKind, ScanSpec
 from service.specs import spec_from
 
 LOOK_BACK = 200
@@ -17,15 +17,17 @@ _log = logging.getLogger(__name__)
 
 
 def incomplete(catalogue: Catalogue, interrupted: Collection[str]) -> Iterator[ScanSpec]:
-    """Yield what lacks views and can be hoped to get them, oldest first.
+    """Yield what lacks views and can be hoped to get them, oldest first; then open replays.
 
     Args:
         catalogue: already recovered.
         interrupted: ids of scans that were under way when the service ended; they may have views
             that the catalogue was not told of.
     """
-    for record in reversed(catalogue.scans(LOOK_BACK)):
-        if record.scan_id not in interrupted and not _lacks_views(catalogue, record):
+    scans = (one for one in catalogue.scans(LOOK_BACK) if one.kind is ScanKind.SCAN)
+    for record in reversed([*catalogue.unfinished(ScanKind.REPLAY), *scans]):
+        due = record.kind is ScanKind.REPLAY or record.scan_id in interrupted
+        if not due and not _lacks_views(catalogue, record):
             continue
         try:
             yield spec_from(record.scan_id, record.request)

@@ -48,6 +48,10 @@ class Feed(Protocol):
         """A scan has ended without its whole skeleton; its recording is at `path` (`.part`)."""
         ...
 
+    def leave(self, scan_id: str) -> None:
+        """Nothing more of such a scan is wanted."""
+        ...
+
     def offer(self, scan_id: str, index: int) -> None:
         """A view is safe on disk."""
         ...
@@ -238,9 +242,28 @@ class LocalRig:
                 return candidate
         raise UnknownScanError(f"there is no recording of scan {scan_id}")
 
+    def adopt(self, scan_id: str, recording: Path) -> None:
+        """Keep a recording as that of a new scan id; see `Rig.adopt`."""
+        path = self._path(scan_id)
+        part = path.with_name(path.name + ".part")
+        try:
+            path.parent.mkdir(parents=True)
+            try:
+                part.hardlink_to(recording)
+            except OSError:  # it lies on another disk
+                shutil.copyfile(recording, part)
+            part.replace(path)
+        except OSError as error:
+            shutil.rmtree(path.parent, ignore_errors=True)
+            raise RigNotReadyError(f"{path}: cannot be written ({error}); make room") from error
+
     def catch_up(self, spec: ScanSpec) -> None:
         """Have the views of an ended scan fed; see `Rig.catch_up`."""
         self._parts.feed.catch_up(spec, self._path(spec.scan_id))
+
+    def leave(self, scan_id: str) -> None:
+        """Feed nothing more of it."""
+        self._parts.feed.leave(scan_id)
 
     def skeleton(self, scan_id: str) -> bytes | None:
         """Return the newest skeleton document of a scan."""

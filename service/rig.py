@@ -21,6 +21,13 @@ class ScanState(StrEnum):
     FAILED = "failed"
 
 
+class ScanKind(StrEnum):
+    """What a scan is. REPLAY: nothing moves, its views come from a recording there is already."""
+
+    SCAN = "scan"
+    REPLAY = "replay"
+
+
 FINISHED = frozenset({ScanState.DONE, ScanState.CANCELLED, ScanState.FAILED})
 CAUGHT_UP = "caught_up"
 """The kind of event that says: nothing more of an earlier scan will be fed to a worker."""
@@ -110,6 +117,10 @@ class PlanRefusedError(RigError):
         self.verdicts = tuple(verdicts)
 
 
+class NotForReplaysError(RigError):
+    """It needs an arm, and a replay has none."""
+
+
 class UnknownScanError(RigError):
     """There is no such scan under way."""
 
@@ -168,11 +179,23 @@ class Rig(Protocol):
         """Return where the recording is (`.part` while it grows). Raises UnknownScanError."""
         ...
 
+    def adopt(self, scan_id: str, recording: Path) -> None:
+        """Keep a recording from elsewhere as that of a new scan id; the file stays where it is.
+
+        Raises:
+            RigNotReadyError: it cannot be kept.
+        """
+        ...
+
     def catch_up(self, spec: ScanSpec) -> None:
         """Have the worker fed with the recording of an ended scan, when it has time for it.
 
         An event CAUGHT_UP tells when it is through, with or without a skeleton of all views.
         """
+        ...
+
+    def leave(self, scan_id: str) -> None:
+        """Feed nothing more of what `catch_up` was asked for."""
         ...
 
     def skeleton(self, scan_id: str) -> bytes | None:

@@ -16,11 +16,14 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError
 from service.bell import Bell
 from service.catalogue import Catalogue, ScanRecord
 from service.incomplete import incomplete
+from service.replays import status_after
 from service.rig import (
     FINISHED,
+    NotForReplaysError,
     Rig,
     RigError,
     RigEvent,
+    ScanKind,
     ScanSpec,
     ScanState,
     ScanStatus,
@@ -100,9 +103,51 @@ class Scans:
             RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved, the key is free.
         """
         with self._starting:
-            used = self.catalogue.used_key(key)
-            if used is None:
-                return self._start(spec, key, body_sha256)
+            return self._answered(key, body_sha256) or self._start(spec, key, body_sha256)
+
+    def replay(
+        self, spec: ScanSpec, recording: Path, views: int, key: str | None, body_sha256: str
+    ) -> Mapping[str, Any]:
+        """Have a recording made into a skeleton and return the status fields; see `start`.
+
+        The worker turns to it when the scan under way, if there is one, leaves it time.
+
+        Args:
+            spec: without waypoints.
+            recording: is kept as that of the replay; the file stays where it is.
+            views: how many it has.
+            key: None = each request is another.
+            body_sha256: of the request.
+
+        Raises:
+            KeyReusedError: the key was used for another body.
+            RigNotReadyError: the recording cannot be kept; the key is free.
+        """
+        with self._starting:
+            if key is not None and (answer := self._answered(key, body_sha256)):
+                return answer
+            status = ScanStatus(
+                scan_id=spec.scan_id,
+                tree_id=spec.tree_id,
+                state=ScanState.RUNNING,
+                views_done=0,
+                views_total=views,
+            )
+            answer = status_fields(status)
+            self._rig.adopt(spec.scan_id, recording)
+            self.catalogue.add_scan(
+                status, fields_of(spec), key, body_sha256, answer, ScanKind.REPLAY
+            )
+        self._add_event(status, "started", {})
+        self._rig.catch_up(spec)
+        self._bell.ring()
+        return answer
+
+    def _answered(self, key: str, body_sha256: str) -> Mapping[str, Any] | None:
+        """Return what a key was answered before. Raises KeyReusedError."""
+        used = self.catalogue.used_key(key)
+        if used is None:
+            return None
         if used.body_sha256 != body_sha256:
             raise KeyReusedError(f"this Idempotency-Key was used for scan {used.scan_id}")
         return used.response
@@ -186,15 +231,18 @@ class Scans:
             logger.exception("acknowledgement not noted")
 
     def pause(self, scan_id: str) -> ScanStatus:
-        """Stop the arm and keep the scan. Raises UnknownScanError."""
+        """Stop the arm and keep the scan. Raises UnknownScanError, NotForReplaysError."""
+        self._require_arm(scan_id)
         return self._command(scan_id, self._rig.pause, lambda record: record.status)
 
     def resume(self, scan_id: str) -> ScanStatus:
         """Go on with a scan, also with one of an earlier life of the service.
 
         Raises:
-            UnknownScanError, RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved.
+            UnknownScanError, NotForReplaysError, RigBusyError, RigNotReadyError,
+            PlanRefusedError: nothing moved.
         """
+        self._require_arm(scan_id)
 
         def again(record: ScanRecord) -> ScanStatus:
             return self._rig.start(spec_from(record.scan_id, record.request), record.views_done)
@@ -206,6 +254,9 @@ class Scans:
 
         def end(record: ScanRecord) -> ScanStatus:
             status = replace(record.status, state=ScanState.CANCELLED, detail="cancelled")
+            with self._refreshing:  # an event of a replay may just be noted
+                self._rig.leave(scan_id)
+                self.catalogue.update(status)
             self._add_event(status, "cancelled", {})
             return status
 
@@ -248,6 +299,10 @@ class Scans:
         if record.state in FINISHED:
             raise ScanOverError(f"scan {scan_id} is {record.state.value}; start a new one")
         return record
+
+    def _require_arm(self, scan_id: str) -> None:
+        if self.record(scan_id).kind is ScanKind.REPLAY:
+            raise NotForReplaysError(f"scan {scan_id} is a replay: cancel it, or let it be")
 
     def _refresh(self, scan_id: str) -> ScanStatus:
         """Note where a scan is; the lock keeps an older answer from overwriting a newer one.
@@ -302,7 +357,8 @@ class Scans:
 
         A skeleton that a newer one has replaced by now is not kept.
         """
-        if self.catalogue.scan(event.scan_id) is None:
+        record = self.catalogue.scan(event.scan_id)
+        if record is None:
             logger.info("event of no scan kind=%s fields=%s", event.kind, dict(event.fields))
             return
         # Noted apart from the scan, which may be cancelled by then. Without a detail it is what
@@ -312,7 +368,19 @@ class Scans:
         skeleton = self._rig.skeleton(event.scan_id)
         if skeleton is not None:
             self.catalogue.add_revision(event.scan_id, skeleton)
-        self._add_event(self._refresh(event.scan_id), event.kind, event.fields)
+        if record.kind is ScanKind.REPLAY:
+            status = self._refresh_replay(event)
+        else:
+            status = self._refresh(event.scan_id)
+        self._add_event(status, event.kind, event.fields)
+
+    def _refresh_replay(self, event: RigEvent) -> ScanStatus:
+        with self._refreshing:
+            status = self.record(event.scan_id).status
+            newest = self.catalogue.newest_revision(event.scan_id)
+            status = status_after(event, status, newest)
+            self.catalogue.update(status)
+        return status
 
     def _add_event(self, status: ScanStatus, kind: str, fields: Mapping[str, object]) -> None:
         data = status_fields(status) | {

@@ -46,6 +46,7 @@ def fields_of(spec: ScanSpec) -> dict[str, Any]:
         "voxel_size_m": spec.config.likelihood.voxel_size_m,
         "farthest_m": spec.config.cluster.farthest_m,
         "rooted": spec.config.canopy.rooted,
+        "fragments": spec.config.canopy.use_fragments,
     }
 
 
@@ -60,6 +61,7 @@ def spec_from(scan_id: str, fields: Mapping[str, Any]) -> ScanSpec:
             # Requests kept by a service that could not set these lack them.
             farthest_m=fields.get("farthest_m", FARTHEST_M),
             rooted=fields.get("rooted", False),
+            fragments=fields.get("fragments", True),
         ),
         **{name: fields[name] for name in _PLAIN_FIELDS},
     )

@@ -20,6 +20,7 @@ SCANS = sa.Table(
     sa.Column("views_total", sa.Integer, nullable=False),
     sa.Column("detail", sa.String, nullable=False),
     sa.Column("recording", sa.String),
+    sa.Column("kind", sa.String, nullable=False, server_default="scan"),
     sa.Column("created_ns", sa.BigInteger, nullable=False, index=True),
     sa.Column("updated_ns", sa.BigInteger, nullable=False),
 )

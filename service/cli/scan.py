@@ -33,6 +33,9 @@ def scan(
         bool,
         typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
     ] = False,
+    fragments: Annotated[
+        bool, typer.Option(help="Use small wood outside the masks (method canopy).")
+    ] = True,
     speed: Annotated[
         float | None,
         typer.Option(help="Of flange and tool in m/s; without, 0.25 or the rig's cap."),
@@ -67,6 +70,7 @@ def scan(
             "segmenter": segmenter,
             "farthest_m": farthest,
             "rooted": rooted,
+            "fragments": fragments,
             "speed_mps": speed,
         }
         result = run_scan(url, body, show, key=key)

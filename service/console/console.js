@@ -9,6 +9,7 @@ const FINISHED = ["done", "cancelled", "failed"];
 const REFRESH_MS = 2000;
 const view = new SkeletonView($("tree"));
 let chosen = null;
+let isReplay = false;
 let stream = new AbortController();
 
 async function ask(path, options) {
@@ -65,7 +66,8 @@ async function showRig() {
 async function showScans() {
   const { scans } = await ask("/v1/scans");
   $("scans").replaceChildren(...scans.map((scan) => {
-    const text = `${scan.tree_id} · ${scan.state} · ${scan.views_done}/${scan.views_total}`;
+    const kind = scan.kind === "replay" ? "replay · " : "";
+    const text = `${kind}${scan.tree_id} · ${scan.state} · ${scan.views_done}/${scan.views_total}`;
     const button = element("button", text, { type: "button", title: scan.scan_id });
     button.ariaCurrent = String(scan.scan_id === chosen);
     button.onclick = () => choose(scan);
@@ -78,6 +80,7 @@ async function showScans() {
 
 function choose(scan) {
   chosen = scan.scan_id;
+  isReplay = scan.kind === "replay";
   stream.abort();
   stream = new AbortController();
   $("scan").hidden = false;
@@ -101,7 +104,8 @@ function showStatus(scan) {
     `${scan.state}, ${scan.views_done} of ${scan.views_total} views. ${scan.detail}`;
   $("detail").className = ["stopped", "failed"].includes(scan.state) ? "bad" : "";
   for (const button of document.querySelectorAll("[data-verb]")) {
-    button.disabled = FINISHED.includes(scan.state);
+    const moves = button.dataset.verb !== "cancel";
+    button.disabled = FINISHED.includes(scan.state) || (isReplay && moves);
   }
   if (scan.views_done > 0) {
     const picture = `/v1/scans/${scan.scan_id}/views/${scan.views_done - 1}/color.jpg`;

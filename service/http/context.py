@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -25,6 +26,7 @@ class Context:
     paths: Mapping[str, Sequence[ArrayLike]]
     caps: SpeedCaps
     segmenter: str
+    uploads: Path
 
 
 async def _context(request: Request) -> Context:

@@ -7,6 +7,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from service.http.context import Context, Here
+from service.rig import ScanKind
 
 router = APIRouter(tags=["rig"])
 
@@ -20,13 +21,15 @@ class _Collector:
         for part in self._here.rig.parts():
             ready.add_metric([part.name], float(part.ready))
         yield ready
-        scans = GaugeMetricFamily("canopy_scans", "Scans by state", labels=["state"])
-        for state, count in self._here.scans.catalogue.count_scans().items():
-            scans.add_metric([state], count)
-        yield scans
+        for name, kind in (("scans", ScanKind.SCAN), ("replays", ScanKind.REPLAY)):
+            text = f"{name.capitalize()} by state"
+            by_state = GaugeMetricFamily(f"canopy_{name}", text, labels=["state"])
+            for state, count in self._here.scans.catalogue.count_scans(kind).items():
+                by_state.add_metric([state], count)
+            yield by_state
         events = CounterMetricFamily("canopy_events", "Events of scans by kind", labels=["kind"])
-        for kind, count in self._here.scans.catalogue.count_events().items():
-            events.add_metric([kind], count)
+        for event, count in self._here.scans.catalogue.count_events().items():
+            events.add_metric([event], count)
         yield events
 
 

@@ -17,7 +17,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from canopy_skel.errors import RecordingError, UsageError
 from service.http.requests import UnknownPathError
-from service.rig import PlanRefusedError, RigBusyError, RigError, RigNotReadyError, UnknownScanError
+from service.rig import (
+    NotForReplaysError,
+    PlanRefusedError,
+    RigBusyError,
+    RigError,
+    RigNotReadyError,
+    UnknownScanError,
+)
 from service.scans import KeyReusedError, ScanOverError
 
 logger = logging.getLogger(__name__)
@@ -25,6 +32,8 @@ logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
 LARGEST_BODY = 1 << 20
 STOP_PATH = "/v1/rig:stop"
+REPLAYS_PATH = "/v1/replays"
+RECORDING_TYPE = "application/x-mcap"
 
 # exception -> status, code, title
 _KNOWN: Mapping[type[Exception], tuple[int, str, str]] = {
@@ -36,6 +45,7 @@ _KNOWN: Mapping[type[Exception], tuple[int, str, str]] = {
     KeyReusedError: (422, "idempotency_key_reused", "Idempotency-Key used for another request"),
     UsageError: (422, "bad_argument", "An argument does not fit"),
     RecordingError: (503, "recording_failed", "The recording cannot be used"),
+    NotForReplaysError: (409, "is_replay", "Not for a replay"),
     RigNotReadyError: (503, "rig_not_ready", "Arm or camera cannot be used now"),
     RigError: (503, "rig_error", "The rig could not do it"),
 }
@@ -90,6 +100,12 @@ def add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _of_framework)
     app.add_middleware(LastResort, largest_body=LARGEST_BODY)
+
+
+def is_recording(request: Request) -> bool:
+    """Say whether the body is a recording, by what the request says of it."""
+    content_type = request.headers.get("content-type", "")
+    return content_type.partition(";")[0].strip().lower() == RECORDING_TYPE
 
 
 def answer(request: Request, problem: Problem) -> JSONResponse:
@@ -195,6 +211,8 @@ class LastResort:
         if "transfer-encoding" in request.headers:
             title = HTTPStatus(411).phrase
             raise Problem(411, "length_required", title, "send the body with a Content-Length")
+        if request.url.path == REPLAYS_PATH and is_recording(request):
+            return  # goes to the disk piece by piece, as far as that has room
         length = request.headers.get("content-length", "0")
         if length.isdecimal() and int(length) > self._largest_body:
             title = HTTPStatus(413).phrase

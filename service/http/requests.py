@@ -63,17 +63,20 @@ class PlanBody(Fields):
         return self
 
 
-class ScanBody(PlanBody):
-    """What to scan and how."""
+TREE_ID = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+TreeId = Annotated[str, Field(pattern=TREE_ID)]
 
-    tree_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+
+class MethodBody(Fields):
+    """How the skeleton is to be made."""
+
     method: MethodName = DEFAULT_METHOD
     voxel_size_m: Annotated[float, Field(ge=0.001, le=0.05, allow_inf_nan=False)] = 0.005
     segmenter: Annotated[
         Literal["recorded", "unet"] | None,
         Field(
-            description="where branch masks come from: the camera, as only a simulated one brings"
-            " them, or the learned segmenter; without, whichever the rig has"
+            description="where branch masks come from: the recording, as of cameras only a"
+            " simulated one brings them, or the learned segmenter; without, whichever is there"
         ),
     ] = None
     farthest_m: Annotated[
@@ -89,15 +92,45 @@ class ScanBody(PlanBody):
         bool,
         Field(description="join everything into one tree, however unsure; method canopy only"),
     ] = False
-    retakes: Annotated[int, Field(ge=0, le=10)] = 2
+    fragments: Annotated[
+        bool, Field(description="use small wood outside the masks; method canopy only")
+    ] = True
 
     @model_validator(mode="after")
-    def _can_be_rooted(self) -> Self:
-        if self.rooted and self.method != "canopy":
+    def _suits_the_method(self) -> Self:
+        if self.method != "canopy" and (self.rooted or not self.fragments):
             raise ValueError(
-                f"method {self.method} cannot be rooted; choose canopy or leave it out"
+                f"rooted and fragments are for method canopy; leave them out with {self.method}"
             )
         return self
+
+    def config(self) -> MethodConfig:
+        """Return the method with these settings."""
+        return method_config(
+            self.method,
+            self.voxel_size_m,
+            farthest_m=self.farthest_m,
+            rooted=self.rooted,
+            fragments=self.fragments,
+        )
+
+
+class ScanBody(PlanBody, MethodBody):
+    """What to scan and how."""
+
+    tree_id: TreeId
+    retakes: Annotated[int, Field(ge=0, le=10)] = 2
+
+
+class ReplayBody(MethodBody):
+    """Which recording to make a skeleton of, and how; an uploaded one has no `scan_id`."""
+
+    scan_id: Annotated[
+        str | None, Field(description="an ended scan of this service, whose recording is taken")
+    ] = None
+    tree_id: Annotated[TreeId | None, Field(description="without, what scan or recording say")] = (
+        None
+    )
 
 
 class AcknowledgeBody(Fields):
@@ -117,7 +150,7 @@ def plan_spec(
     """
     usual = SpeedCaps()
     return ScanSpec(
-        scan_id=f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{token_hex(4)}",
+        scan_id=_new_scan_id(),
         tree_id="",
         waypoints=_waypoints(body, paths),
         config=MethodConfig(),
@@ -147,12 +180,28 @@ def scan_spec(
     return replace(
         plan_spec(body, paths, caps),
         tree_id=body.tree_id,
-        config=method_config(
-            body.method, body.voxel_size_m, farthest_m=body.farthest_m, rooted=body.rooted
-        ),
+        config=body.config(),
         segmenter=body.segmenter or segmenter,
         retakes=body.retakes,
     )
+
+
+def replay_spec(body: ReplayBody, tree_id: str, segmenter: str) -> ScanSpec:
+    """Return the replay a body asks for, under a new scan id.
+
+    tree_id, segmenter: where the body names none.
+    """
+    return ScanSpec(
+        scan_id=_new_scan_id(),
+        tree_id=body.tree_id or tree_id,
+        waypoints=(),
+        config=body.config(),
+        segmenter=body.segmenter or segmenter,
+    )
+
+
+def _new_scan_id() -> str:
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{token_hex(4)}"
 
 
 def _waypoints(body: PlanBody, paths: Mapping[str, Sequence[ArrayLike]]) -> tuple[FloatArray, ...]:

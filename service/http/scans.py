@@ -15,7 +15,7 @@ from service.catalogue import MOST_NUMBER, EventRecord, ScanRecord
 from service.http.access import COMMAND
 from service.http.context import Context, Here, KnownScan
 from service.http.files import file_response
-from service.http.problems import Problem
+from service.http.problems import RECORDING_TYPE, Problem
 from service.http.requests import ScanBody, scan_spec
 from service.pictures import NoPictureError, PictureKind, open_recorded
 from service.rig import FINISHED
@@ -27,9 +27,10 @@ _LOOK_AGAIN_S = 5.0
 _LAST_WORDS_S = 0.3
 
 
-def idempotency_key(
-    idempotency_key: Annotated[str | None, Header(min_length=1, max_length=255)] = None,
-) -> str:
+Key = Annotated[str | None, Header(alias="idempotency-key", min_length=1, max_length=255)]
+
+
+def idempotency_key(idempotency_key: Key = None) -> str:
     """Return the key, or refuse: without one a repeated request would move the arm twice."""
     if idempotency_key is None:
         raise Problem(
@@ -75,6 +76,7 @@ def _fields(here: Context, record: ScanRecord) -> dict[str, Any]:
     return status_fields(here.scans.status_of(record)) | {
         "created": _rfc3339(record.created_ns),
         "updated": _rfc3339(record.updated_ns),
+        "kind": record.kind.value,
     }
 
 
@@ -158,4 +160,4 @@ def download_recording(
     if stream is None:
         raise Problem(404, "no_recording", "No recording", f"scan {scan_id} has no recording")
     name = f"{scan_id}.mcap"
-    return file_response(stream, name, "application/x-mcap", asked=asked, if_range=if_range)
+    return file_response(stream, name, RECORDING_TYPE, asked=asked, if_range=if_range)

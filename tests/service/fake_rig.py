@@ -37,6 +37,9 @@ class FakeRig:
         self.acknowledged: list[str] = []
         self.holds: list[str] = []
         self.to_catch_up: list[str] = []
+        self.fed: list[ScanSpec] = []
+        self.left: list[str] = []
+        self.adopted: dict[str, bytes] = {}
         self._scans: dict[str, ScanStatus] = {}
         self._skeletons: dict[str, bytes] = {}
         self._listeners: list[Callable[[RigEvent], None]] = []
@@ -143,12 +146,21 @@ class FakeRig:
             for detail in [self.broken_parts.get(name, "")]
         ]
 
+    def adopt(self, scan_id: str, recording: Path) -> None:
+        if self.refusal is not None:
+            raise self.refusal
+        self.adopted[scan_id] = recording.read_bytes()
+
     def recording_path(self, scan_id: str) -> Path:
         self.status(scan_id)
         return self.recording
 
     def catch_up(self, spec: ScanSpec) -> None:
         self.to_catch_up.append(spec.scan_id)
+        self.fed.append(spec)
+
+    def leave(self, scan_id: str) -> None:
+        self.left.append(scan_id)
 
     def skeleton(self, scan_id: str) -> bytes | None:
         return self._skeletons.get(scan_id)

@@ -12,7 +12,7 @@ from live_service import skeleton
 from canopy_skel.errors import UsageError
 from service import catalogue as catalogue_module
 from service.catalogue import INTERRUPTED, Catalogue
-from service.rig import ScanState, ScanStatus
+from service.rig import ScanKind, ScanState, ScanStatus
 from service.tables import METADATA
 
 ROOT = Path(__file__).parents[2]
@@ -64,9 +64,12 @@ def test_an_old_catalogue_opens_again(tmp_path):
 
 
 def test_a_catalogue_of_an_earlier_version_is_brought_up_to_date(tmp_path):
-    with Catalogue(tmp_path) as catalogue, catalogue.transaction() as connection:
-        catalogue_at_first(connection)
     with Catalogue(tmp_path) as catalogue:
+        catalogue.add_scan(status(), {}, "k", "sha", {})
+        with catalogue.transaction() as connection:
+            catalogue_at_first(connection)
+    with Catalogue(tmp_path) as catalogue:
+        assert catalogue.scan("s1").kind is ScanKind.SCAN
         assert catalogue.last_stop() == 0
         catalogue.add_stop()
         assert catalogue.last_stop() == 1
@@ -75,6 +78,7 @@ def test_a_catalogue_of_an_earlier_version_is_brought_up_to_date(tmp_path):
 def catalogue_at_first(connection):
     """Undo what later versions have changed."""
     connection.execute(sa.text("DROP TABLE stops"))
+    connection.execute(sa.text("ALTER TABLE scans DROP COLUMN kind"))
     connection.execute(sa.text("UPDATE alembic_version SET version_num = '0001'"))
 
 

@@ -28,6 +28,7 @@ from live_rig import (
 from canopy_skel.recording import read_recording
 from mock_hw.fake_ur.process import FakeUr, free_host
 
+DEMO = Path(__file__).parents[2] / "recordings/demo_apple.mcap"
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
 
 
@@ -52,6 +53,23 @@ def test_live_and_replayed_skeletons_are_the_same_bytes(rig, tmp_path):
     assert live == rig.replayed(scan_id, tmp_path)
     answer = rig.http.get(f"/v1/scans/{scan_id}/skeleton.glb")
     assert answer.content[:4] == b"glTF"
+
+
+def test_replays_give_the_bytes_that_the_command_line_gives(rig, tmp_path):
+    """The recording that is sent says the hand-eye transform only once."""
+    answer = rig.http.post(
+        "/v1/replays", content=DEMO.read_bytes(), headers={"Content-Type": "application/x-mcap"}
+    )
+    sent = answer.json()["scan_id"]
+    assert rig.wait(sent, "done")["views_done"] == 4
+    told_in_it = read_recording(DEMO).scan_id.encode()
+    assert rig.skeleton(sent) == rig.replayed(sent, tmp_path).replace(told_in_it, sent.encode())
+    again = rig.http.post("/v1/replays", json={"scan_id": sent, "method": "paper"}).json()
+    assert rig.wait(again["scan_id"], "done")["views_done"] == 4
+    document = json.loads(rig.skeleton(again["scan_id"]))
+    assert (document["method"]["name"], document["views"]["used"]) == ("paper", 4)
+    picture = rig.http.get(f"/v1/scans/{sent}/views/3/color.jpg")
+    assert picture.content[:2] == b"\xff\xd8"
 
 
 @pytest.mark.timeout(400)

@@ -1,0 +1,141 @@
+"""Route of replays: a skeleton of a recording that was sent along, or of one that is here."""
+
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from secrets import token_hex
+
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import ValidationError
+
+from canopy_skel.errors import RecordingError
+from service.http.access import COMMAND
+from service.http.context import Context, Here
+from service.http.problems import RECORDING_TYPE, REPLAYS_PATH, Problem, is_recording
+from service.http.requests import TREE_ID, ReplayBody, replay_spec
+from service.http.scans import Key
+from service.pictures import recorded_file
+from service.replays import has_masks, replayable, whole_views
+from service.rig import FINISHED
+
+router = APIRouter(tags=["scans"])
+ROOM_LEFT_BYTES = 1 << 30
+"""An upload leaves this much of the disk to the recordings of scans."""
+_BODIES = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {"schema": ReplayBody.model_json_schema()},
+            RECORDING_TYPE: {"schema": {"type": "string", "format": "binary"}},
+        },
+    }
+}
+
+
+@router.post(REPLAYS_PATH, status_code=202, dependencies=COMMAND, openapi_extra=_BODIES)
+async def start_replay(request: Request, here: Here, idempotency_key: Key = None) -> JSONResponse:
+    """Make a skeleton of an ended scan's recording, or of one that is sent; nothing moves.
+
+    Sent as `application/x-mcap`, with the other fields of the JSON body in the query.
+    """
+    if not is_recording(request):
+        body = _asked(await request.body())
+        return await run_in_threadpool(_replay_stored, here, body, idempotency_key)
+    body = _asked(dict(request.query_params))
+    if body.scan_id is not None:
+        raise _invalid("query.scan_id", "send a recording, or name a scan")
+    with _upload(here.uploads, _length(request)) as file:
+        content = await _receive(request, file)
+        return await run_in_threadpool(_replay, here, body, file, content, idempotency_key)
+
+
+def _asked(given: bytes | dict[str, str]) -> ReplayBody:
+    try:
+        if isinstance(given, bytes):
+            return ReplayBody.model_validate_json(given)
+        return ReplayBody.model_validate(given)
+    except ValidationError as error:
+        where = "body" if isinstance(given, bytes) else "query"
+        errors = [one | {"loc": (where, *one["loc"])} for one in error.errors()]
+        raise RequestValidationError(errors) from error
+
+
+def _invalid(where: str, what: str) -> RequestValidationError:
+    return RequestValidationError([{"loc": tuple(where.split(".")), "msg": what}])
+
+
+def _replay_stored(here: Context, body: ReplayBody, key: str | None) -> JSONResponse:
+    if body.scan_id is None:
+        raise _invalid("body.scan_id", f"name an ended scan, or send one as {RECORDING_TYPE}")
+    record = here.scans.record(body.scan_id)
+    if record.state not in FINISHED:
+        detail = f"scan {body.scan_id} is {record.state.value}: wait for its end, or cancel it"
+        raise Problem(409, "scan_under_way", "The scan has not ended", detail)
+    file = recorded_file(here.scans.recording(body.scan_id))
+    if file is None:
+        raise Problem(404, "no_recording", "No recording", f"scan {body.scan_id} has no recording")
+    return _replay(here, body, file, body.scan_id, key, record.tree_id)
+
+
+def _replay(
+    here: Context,
+    body: ReplayBody,
+    file: Path,
+    content: str,
+    key: str | None,
+    tree_id: str | None = None,
+) -> JSONResponse:
+    """Start it. content: what tells the recording from others."""
+    try:
+        recording = replayable(file)
+    except RecordingError as error:
+        detail = str(error).removeprefix(f"{file}: ")
+        raise Problem(422, "unusable_recording", "The recording cannot be used", detail) from error
+    masks = has_masks(recording)
+    if body.segmenter == "recorded" and not masks:
+        detail = "it holds no branch masks; leave the segmenter out, or ask for unet"
+        raise Problem(422, "unusable_recording", "The recording cannot be used", detail)
+    said = recording.metadata.get("tree_id", "")
+    tree_id = tree_id or (said if re.fullmatch(TREE_ID, said) else "unnamed")
+    spec = replay_spec(body, tree_id, "recorded" if masks else "unet")
+    digest = sha256(f"{body.model_dump_json()} {content}".encode()).hexdigest()
+    status = here.scans.replay(spec, file, whole_views(recording), key, digest)
+    return JSONResponse(status, 202, headers={"Location": f"/v1/scans/{status['scan_id']}"})
+
+
+def _length(request: Request) -> int:
+    length = request.headers.get("content-length", "")
+    if not length.isdecimal():
+        raise Problem(411, "length_required", "Length Required", "send it with a Content-Length")
+    return int(length)
+
+
+@contextmanager
+def _upload(folder: Path, length: int) -> Iterator[Path]:
+    """Give a place for a recording of so many bytes, which goes when this is left."""
+    free = shutil.disk_usage(folder).free
+    if free - length < ROOM_LEFT_BYTES:
+        detail = f"it has {length >> 20} MiB, and {free >> 20} MiB are free, of which"
+        detail += f" {ROOM_LEFT_BYTES >> 20} are kept for scans; make room"
+        raise Problem(507, "no_room", "No room for the recording", detail)
+    file = folder / f"{token_hex(8)}.mcap"
+    try:
+        yield file
+    finally:
+        file.unlink(missing_ok=True)
+
+
+async def _receive(request: Request, file: Path) -> str:
+    """Write the body to a file and return its SHA-256."""
+    digest = sha256()
+    with file.open("wb") as stream:
+        async for piece in request.stream():
+            digest.update(piece)
+            await run_in_threadpool(stream.write, piece)
+    return digest.hexdigest()
