@@ -161,6 +161,15 @@ $("start").onsubmit = (event) => {
     await showScans();
   });
 };
+$("replay").onchange = () => attempt(async () => {
+  const [recording] = $("replay").files;
+  if (!recording) return;
+  $("replay").value = "";  // the same one may be chosen again
+  const headers = { "Content-Type": "application/x-mcap" };
+  const scan = await ask("/v1/replays", withKey({ method: "POST", headers, body: recording }));
+  choose({ ...scan, kind: "replay" });
+  await showScans();
+});
 $("picture").onerror = () => {
   $("picture").hidden = true;
   setTimeout(() => { $("picture").src += ""; }, REFRESH_MS);

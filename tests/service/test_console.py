@@ -3,6 +3,7 @@
 import shutil
 
 import pytest
+from fake_rig import DEMO_RECORDING
 from live_service import serving, skeleton, wait_until
 from playwright.sync_api import expect, sync_playwright
 
@@ -54,6 +55,19 @@ def test_an_operator_starts_a_scan_watches_the_skeleton_grow_and_stops_the_arm(p
         expect(page.locator("#legend")).to_contain_text("Skeleton of 2 views: 2.0 m")
         page.get_by_role("button", name="STOP").click()
         wait_until(lambda: live.rig.stops == 1)
+
+
+def test_a_recording_is_replayed_which_cannot_be_paused(page, tmp_path):
+    with serving(tmp_path) as live:
+        page.goto(live.url)
+        page.get_by_label("Recording").set_input_files(DEMO_RECORDING)
+        expect(page.locator("#detail")).to_contain_text("running, 0 of 4 views")
+        [spec] = live.rig.fed
+        assert live.rig.adopted == {spec.scan_id: DEMO_RECORDING.read_bytes()}
+        expect(page.get_by_role("button", name="Pause")).to_be_disabled()
+        page.get_by_role("button", name="Cancel").click()
+        expect(page.locator("#detail")).to_contain_text("cancelled")
+        expect(page.locator("#scans")).to_contain_text("replay · tree_apple_21 · cancelled")
 
 
 def test_a_stop_is_shown_and_acknowledged_with_a_reason(page, tmp_path):
