@@ -13,6 +13,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import ValidationError
+from starlette.requests import ClientDisconnect
 
 from canopy_skel.errors import RecordingError
 from service.http.access import COMMAND
@@ -27,18 +28,24 @@ from service.rig import FINISHED
 router = APIRouter(tags=["scans"])
 ROOM_LEFT_BYTES = 1 << 30
 """An upload leaves this much of the disk to the recordings of scans."""
-_BODIES = {
+_SCHEMA = ReplayBody.model_json_schema()
+_TWO_BODIES = {
     "requestBody": {
         "required": True,
         "content": {
-            "application/json": {"schema": ReplayBody.model_json_schema()},
+            "application/json": {"schema": _SCHEMA},
             RECORDING_TYPE: {"schema": {"type": "string", "format": "binary"}},
         },
-    }
+    },
+    "parameters": [
+        {"in": "query", "name": name, "schema": schema}
+        for name, schema in _SCHEMA["properties"].items()
+        if name != "scan_id"
+    ],
 }
 
 
-@router.post(REPLAYS_PATH, status_code=202, dependencies=COMMAND, openapi_extra=_BODIES)
+@router.post(REPLAYS_PATH, status_code=202, dependencies=COMMAND, openapi_extra=_TWO_BODIES)
 async def start_replay(request: Request, here: Here, idempotency_key: Key = None) -> JSONResponse:
     """Make a skeleton of an ended scan's recording, or of one that is sent; nothing moves.
 
@@ -134,8 +141,14 @@ def _upload(folder: Path, length: int) -> Iterator[Path]:
 async def _receive(request: Request, file: Path) -> str:
     """Write the body to a file and return its SHA-256."""
     digest = sha256()
-    with file.open("wb") as stream:
-        async for piece in request.stream():
-            digest.update(piece)
-            await run_in_threadpool(stream.write, piece)
+    title = "The recording did not arrive"
+    try:
+        with file.open("wb") as stream:
+            async for piece in request.stream():
+                digest.update(piece)
+                await run_in_threadpool(stream.write, piece)
+    except OSError as error:
+        raise Problem(507, "no_room", title, f"it cannot be written: {error.strerror}") from error
+    except ClientDisconnect as error:
+        raise Problem(400, "upload_broken_off", title, "send it again, to its end") from error
     return digest.hexdigest()

@@ -1,6 +1,7 @@
 """Replays over HTTP: recordings that are sent or that are here, and no arm."""
 
 import json
+import socket
 from io import BytesIO
 
 import pytest
@@ -163,6 +164,17 @@ def test_an_upload_leaves_nothing_behind(live, tmp_path):
     sent(live, key="k1")  # the key was left free
 
 
+def test_an_upload_that_breaks_off_leaves_nothing(live, tmp_path, caplog):
+    address = (live.http.base_url.host, live.http.base_url.port)
+    with socket.create_connection(address) as client:
+        head = "POST /v1/replays HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n"
+        client.sendall(f"{head}Content-Type: application/x-mcap\r\n\r\n".encode() + b"half")
+        wait_until(lambda: list((tmp_path / "uploads").iterdir()))
+    wait_until(lambda: not list((tmp_path / "uploads").iterdir()))
+    assert live.rig.adopted == {}
+    assert "unexpected error" not in caplog.text
+
+
 def test_there_must_be_room_for_it(live, monkeypatch):
     monkeypatch.setattr(replays, "ROOM_LEFT_BYTES", 1 << 60)
     problem(send(live), 507, "no_room")
@@ -263,5 +275,6 @@ def test_metrics_tell_replays_from_scans(live):
 
 def test_the_schema_names_both_bodies(idle):
     schema = json.loads(idle.http.get("/openapi.json").text)
-    bodies = schema["paths"]["/v1/replays"]["post"]["requestBody"]["content"]
-    assert set(bodies) == {"application/json", "application/x-mcap"}
+    route = schema["paths"]["/v1/replays"]["post"]
+    assert set(route["requestBody"]["content"]) == {"application/json", "application/x-mcap"}
+    assert {"method", "idempotency-key"} <= {one["name"] for one in route["parameters"]}
