@@ -20,6 +20,7 @@ DriverError
 │   │   └── NotAcknowledgedError    the cause is gone, but nobody has said so yet
 │   └── ArmLinkError                the arm cannot be asked
 │       ├── NotConnectedError       outside the `with` block, or no such controller
+│       ├── ArmTakenError           another client or program has the controller
 │       ├── LinkLostError           the connection broke
 │       ├── ControllerFrozenError   connected, but the controller says nothing
 │       └── DriverProcessError      the process that talks to the controller died or hangs
@@ -107,6 +108,10 @@ class ArmLinkError(ArmError):
 
 class NotConnectedError(ArmLinkError):
     """The arm was used outside its `with` block, or there is no controller at that address."""
+
+
+class ArmTakenError(ArmLinkError):
+    """Another client or program has the controller; nothing was done to it."""
 
 
 class LinkLostError(ArmLinkError):

@@ -5,6 +5,9 @@ Euclidean group", IEEE Transactions on Robotics and Automation, 1994), over all 
 Moving it until the corners' pixels fit best makes it worse: errors of the arm's poses, not of the
 pixels, are what differs between views, and pixels hardly tell a tilt from a shift.
 
+A view counts by how certain its board pose is: the tilt of a few corners is known far worse than
+that of a whole board, and would spoil what the others tell.
+
 The size of the board is one more unknown beside the translation: a board said 1 % too large puts
 the camera 5 mm wrong at half a metre, and views at one distance fit as well as before.
 """
@@ -34,6 +37,8 @@ FITTING_PX = 2.0
 """A view with a smaller residual fits the others; if most views have larger ones, none does."""
 _FITTING_MEDIANS = 4.0
 _SUBSETS, _SUBSET_VIEWS, _MOST_REFITS = 100, 4, 10
+_CORNER_STD_PX, _ARM_STD_M, _ARM_STD_RAD = 0.2, 1e-4, 2e-4
+"""How wrong, on each axis, corners are found and flanges stand; only their ratio matters."""
 
 
 class CalibrationError(CanopyError):
@@ -84,13 +89,16 @@ class HandEye:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Poses:
-    """base_from_tool0, camera_from_board: (V, 4, 4)."""
+    """base_from_tool0, camera_from_board: (V, 4, 4). variances: (V, 2), of turn and shift."""
 
     base_from_tool0: FloatArray
     camera_from_board: FloatArray
+    variances: FloatArray
 
     def only(self, chosen: BoolArray | IntArray) -> "_Poses":
-        return _Poses(self.base_from_tool0[chosen], self.camera_from_board[chosen])
+        return _Poses(
+            self.base_from_tool0[chosen], self.camera_from_board[chosen], self.variances[chosen]
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -123,12 +131,19 @@ def calibrate(views: Sequence[BoardView]) -> HandEye:
         CalibrationError: too few views, or the camera was hardly turned, or about one axis only.
     """
     _require_enough(len(views))
+    board = np.unique(np.concatenate([view.corners_in_board for view in views]), axis=0)
+    camera_from_board = np.array([_camera_from_board(view) for view in views])
     poses = _Poses(
         np.array([view.base_from_tool0 for view in views]),
-        np.array([_camera_from_board(view) for view in views]),
+        camera_from_board,
+        np.array(
+            [
+                _variances(view, pose, board.mean(axis=0))
+                for view, pose in zip(views, camera_from_board, strict=True)
+            ]
+        ),
     )
     _require_turns(poses)
-    board = np.unique(np.concatenate([view.corners_in_board for view in views]), axis=0)
     whole = [
         _completed(view, pose, board)
         for view, pose in zip(views, poses.camera_from_board, strict=True)
@@ -187,14 +202,35 @@ def _require_turns(poses: _Poses) -> None:
 
 
 def _camera_from_board(view: BoardView) -> FloatArray:
-    pinhole = view.intrinsics
-    matrix = np.array(
-        [[pinhole.fx_px, 0, pinhole.cx_px], [0, pinhole.fy_px, pinhole.cy_px], [0, 0, 1.0]]
-    )
+    matrix = _matrix(view.intrinsics)
     found, turn, shift = cv2.solvePnP(view.corners_in_board, view.pixels, matrix, np.zeros(0))
     if not found:
         raise CalibrationError(f"view {view.index}: the corners found are not those of a board")
     return transform_from(Rotation.from_rotvec(turn[:, 0]).as_matrix(), shift[:, 0])
+
+
+def _matrix(pinhole: Intrinsics) -> FloatArray:
+    return np.array(
+        [[pinhole.fx_px, 0, pinhole.cx_px], [0, pinhole.fy_px, pinhole.cy_px], [0, 0, 1.0]]
+    )
+
+
+def _variances(view: BoardView, camera_from_board: FloatArray, middle: FloatArray) -> FloatArray:
+    """Return how uncertain turn (rad²) and shift (m²) of a view's motions are, by its corners.
+
+    middle: (3,) of the board. To begin with, the pose is known to 1 rad and 1 m: corners in a row
+    tell no tilt about it.
+    """
+    turned = (view.corners_in_board - middle) @ camera_from_board[:3, :3].T
+    middle_in_camera = transform_points(camera_from_board, middle[None])[0]
+    _, slopes = cv2.projectPoints(
+        turned, np.zeros(3), middle_in_camera, _matrix(view.intrinsics), np.zeros(0)
+    )
+    known = slopes[:, :6].T @ slopes[:, :6] / _CORNER_STD_PX**2 + np.eye(6)
+    of_pose = np.diag(np.linalg.inv(known))
+    turn = of_pose[:3].sum() + 3 * _ARM_STD_RAD**2
+    shift = of_pose[3:].sum() + 3 * _ARM_STD_M**2
+    return np.array([turn, shift + turn * (middle_in_camera**2).sum()])
 
 
 def _completed(view: BoardView, camera_from_board: FloatArray, board: FloatArray) -> BoardView:
@@ -220,6 +256,14 @@ def _motions(poses: _Poses) -> tuple[FloatArray, FloatArray]:
     a: FloatArray = tool0_from_base[i] @ poses.base_from_tool0[j]
     b: FloatArray = poses.camera_from_board[i] @ board_from_camera[j]
     return a, b
+
+
+def _weights(poses: _Poses) -> FloatArray:
+    """Return how much each pair of views counts, (P, 2), for turn and shift; 1 on average."""
+    i, j = np.triu_indices(len(poses.variances), k=1)
+    weights = 1 / (poses.variances[i] + poses.variances[j])
+    weighed: FloatArray = weights / weights.mean(axis=0)
+    return weighed
 
 
 def _consensus_px(views: Sequence[BoardView], poses: _Poses) -> FloatArray:
@@ -250,19 +294,22 @@ def _fitting(residual_px: FloatArray) -> BoolArray:
 def _fit(poses: _Poses) -> _Fit:
     """Return what fits AX = XB best over all pairs of views, and where the board is then."""
     a, b = _motions(poses)
-    turn = _park_martin_turn(a[:, :3, :3], b[:, :3, :3])
+    turn_weights, shift_weights = _weights(poses).T
+    turn = _park_martin_turn(a[:, :3, :3], b[:, :3, :3], turn_weights)
     # (R_A - 1) t_X = scale R_X t_B - t_A; solved for scale - 1, which stays 0 if nothing tells it
     board_m = b[:, :3, 3] @ turn.T
     left = np.concatenate([a[:, :3, :3] - np.eye(3), -board_m[..., None]], axis=2).reshape(-1, 4)
-    found = np.linalg.lstsq(left, (board_m - a[:, :3, 3]).reshape(-1), rcond=None)[0]
+    right = (board_m - a[:, :3, 3]).reshape(-1)
+    by = np.sqrt(shift_weights).repeat(3)
+    found = np.linalg.lstsq(left * by[:, None], right * by, rcond=None)[0]
     tool_from_camera, scale = transform_from(turn, found[:3]), 1 + float(found[3])
     return _Fit(tool_from_camera, _mean_board(poses, tool_from_camera, scale), scale)
 
 
-def _park_martin_turn(a: FloatArray, b: FloatArray) -> FloatArray:
+def _park_martin_turn(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the (3, 3) turn that takes the axes of the (P, 3, 3) turns b to those of a best."""
     axes_a, axes_b = (Rotation.from_matrix(turns).as_rotvec() for turns in (a, b))
-    u, _, vt = np.linalg.svd(axes_a.T @ axes_b)
+    u, _, vt = np.linalg.svd((weights[:, None] * axes_a).T @ axes_b)
     turn: FloatArray = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     return turn
 
@@ -271,8 +318,10 @@ def _mean_board(poses: _Poses, tool_from_camera: FloatArray, scale: float) -> Fl
     camera_from_board = poses.camera_from_board.copy()
     camera_from_board[:, :3, 3] *= scale
     boards = poses.base_from_tool0 @ tool_from_camera @ camera_from_board
-    turn = Rotation.from_matrix(boards[:, :3, :3]).mean()
-    return transform_from(turn.as_matrix(), boards[:, :3, 3].mean(axis=0))
+    turn_weights, shift_weights = 1 / poses.variances.T
+    turn = Rotation.from_matrix(boards[:, :3, :3]).mean(weights=turn_weights)
+    place_m = np.average(boards[:, :3, 3], axis=0, weights=shift_weights)
+    return transform_from(turn.as_matrix(), place_m)
 
 
 def _jackknife(poses: _Poses, fit: _Fit) -> tuple[float, float, float]:

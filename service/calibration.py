@@ -25,8 +25,9 @@ from drivers.hand_eye import (
 MOST_STD_M, MOST_STD_DEG = 0.001, 0.1
 """What is accepted: the errors with which all figures on simulated trees were measured."""
 MOST_SCALE_STD, MOST_SCALE_OFF = 0.001, 0.005
-"""Measured on synthetic views: with a scale known to 0.1 % nothing was 1 mm wrong. A scale that is
-off is no error of the result, but says that the board is not the one that was measured."""
+"""Measured on synthetic views: with a scale known to 0.1 % little was 1 mm wrong, nothing 1.3. A
+scale that is off is no error of the result, but says that the board is not the one that was
+measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

@@ -14,6 +14,7 @@ from drivers.errors import (
     ArmBusyError,
     ArmError,
     ArmLinkError,
+    ArmTakenError,
     ControllerFrozenError,
     DriverProcessError,
     MoveInterruptedError,
@@ -28,7 +29,7 @@ from drivers.ur5.clock import ClockOffset
 from drivers.ur5.dashboard import Dashboard
 from drivers.ur5.link import ChildLink
 from drivers.ur5.messages import MoveStatus, Prepare, Sample, Stop, Ur5Config
-from drivers.ur5.reasons import power_hold, safety_hold
+from drivers.ur5.reasons import anothers_program, power_hold, safety_hold
 from drivers.ur5.requests import request_for
 
 log = logging.getLogger(__name__)
@@ -37,6 +38,8 @@ _FRESH_NS = 50_000_000
 _UNLOCK_S = 2.0
 _LAG_S = 0.03
 """The state may reach us this much later than its consequences."""
+_WATCHDOG_LAG_S = 0.3
+"""How much later than due the watchdog may have ended a program of ours that nobody feeds."""
 
 
 class Ur5Arm:
@@ -64,6 +67,7 @@ class Ur5Arm:
         """Connect; nothing is uploaded to the controller and nothing moves.
 
         Raises:
+            ArmTakenError: another client has the controller; it has noticed nothing.
             ArmLinkError: no controller there, or it does not answer.
         """
         link = ChildLink(self._config, self._on_sample, self._on_down)
@@ -107,9 +111,14 @@ class Ur5Arm:
         )
 
     def check(self) -> None:
-        """Raise what keeps the arm from moving, local control too; see `Arm.check`."""
+        """Raise what keeps the arm from moving, local control too; see `Arm.check`.
+
+        Raises:
+            ArmTakenError: another client has the controller, or another's program is on it.
+        """
         sample, _ = self._fresh()
         raise_unless_movable(self.state(), also=(ArmMode.MOVING, ArmMode.INTERRUPTED))
+        self._require_alone(_LAG_S)
         self._require_remote_control(sample)
 
     def start_move(self, move: Move) -> None:
@@ -138,33 +147,42 @@ class Ur5Arm:
     def stop(self) -> None:
         """Brake through the child; where that is not confirmed in time, end it and the program.
 
+        Where the arm is another's, or not opened, the program is ended just so: whoever asks for
+        a stop sees an arm that must not move, no matter who moves it.
+
         Raises:
             ArmLinkError: neither way is left.
         """
-        link = self._connected()
-        with self._sending:
-            self._stops += 1
-            pending = link.post(Stop())
-            self._stopped_move = self._move
-        if pending.wait(self._config.stop_timeout_s) is None:
+        link = self._link
+        if link is not None:
+            with self._sending:
+                self._stops += 1
+                pending = link.post(Stop())
+                self._stopped_move = self._move
+            if pending.wait(self._config.stop_timeout_s) is not None:
+                return
             if link.up:
                 link.kill("did not confirm a stop and was ended")
-            try:
-                self._dashboard.ask("stop")
-            except OSError as error:
-                raise NotConnectedError(
-                    f"stop not confirmed, {self._config.host} does not answer ({error}):"
-                    " use the emergency stop"
-                ) from error
+        try:
+            self._dashboard.ask("stop")
+        except OSError as error:
+            raise NotConnectedError(
+                f"stop not confirmed, {self._config.host} does not answer ({error}):"
+                " use the emergency stop"
+            ) from error
 
     def acknowledge(self, reason: str) -> None:
         """Unlock, power and release the arm after a stop; see `Arm.acknowledge`.
 
         A controller that has just come back is waited for, so that one acknowledgement is enough.
+
+        Raises:
+            ArmTakenError: another client has the controller, or another's program runs on it.
         """
         sample = self._returned()
         if not (self._latch or safety_hold(sample) or power_hold(sample)):
             return
+        self._require_alone(self._unfed_s(), paused_too=False)
         log.info("%s: acknowledged: %s", self._config.host, reason)
         try:
             self._dashboard.ask("stop")
@@ -200,12 +218,25 @@ class Ur5Arm:
 
     def _prepare(self, sample: Sample) -> None:
         """Have the control script run."""
+        self._require_alone(self._unfed_s())
         self._require_remote_control(sample)
         reply = self._connected().post(Prepare()).wait(self._config.connect_timeout_s)
         if reply is None:
             raise self._give_up("did not get the control script to run")
         if reply.refusal:
             raise self._why_refused(reply.refusal)
+
+    def _require_alone(self, patience_s: float, *, paused_too: bool = True) -> None:
+        """Refuse to replace or end a program that is not ours, and does not end in time."""
+        if not self._wait(lambda sample: not anothers_program(sample, paused_too), patience_s):
+            raise ArmTakenError(
+                f"the controller at {self._config.host} is taken: a program that is not ours runs"
+                " or is paused there; wait for its end, or end it at the pendant"
+            )
+
+    def _unfed_s(self) -> float:
+        """Return how long a program of ours may outlive the process that has fed it."""
+        return 1 / self._config.watchdog_hz + _WATCHDOG_LAG_S
 
     def _require_remote_control(self, sample: Sample) -> None:
         """Refuse local control while our script does not run: it could not be uploaded.
@@ -228,6 +259,7 @@ class Ur5Arm:
         time.sleep(_LAG_S)
         try:
             raise_unless_movable(self.state(), also=(ArmMode.INTERRUPTED,))
+            self._require_alone(_LAG_S)
         except ArmError as error:
             return error
         return MoveRefusedError(f"{refusal}; see the log of the controller")

@@ -17,6 +17,7 @@ import threading
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, NoReturn
 
+from drivers.ur5.claim import claim_upper_half
 from drivers.ur5.messages import Leave, Reply, Ur5Config
 from drivers.ur5.mover import Mover
 from drivers.ur5.watch import VARIABLES, MoveRecord, Parent, Watch
@@ -27,6 +28,13 @@ if TYPE_CHECKING:
 
 _FREQUENCY_HZ = 125.0
 _UPKEEP_S = 0.01
+_IN_USE = "already in use"
+"""What ur-rtde says, and nothing else of what it says, when another client has the registers."""
+_TAKEN = (
+    "the controller at {} is taken: its input registers are held by another program (a second"
+    " service, another RTDE client, or EtherNet/IP, PROFINET or MODBUS in its installation) or by a"
+    " lost connection for a moment yet; end that one, and this one then connects by itself"
+)
 
 
 def probe(host: str, timeout_s: float = 1.0) -> tuple[str, str] | None:
@@ -59,11 +67,18 @@ def main(pipe: Connection) -> NoReturn:
     if problem:
         parent.end(*problem)
     try:
+        claim = claim_upper_half(config.host)
+        if claim is None:
+            parent.end("ArmTakenError", _TAKEN.format(config.host))
         receive, control = _connect(config.host)
     except ImportError as error:
         parent.end("NotConnectedError", f"{error}: install ur-rtde (wheels: Python 3.11, 3.12)")
     except RuntimeError as error:
+        if _IN_USE in str(error):
+            parent.end("ArmTakenError", _TAKEN.format(config.host))
         parent.end("NotConnectedError", f"{config.host}: {error}")
+    except OSError as error:
+        parent.end("LinkLostError", f"{config.host}: {error}")
     try:
         watch = Watch(receive, parent, record)
         threading.Thread(target=watch.run, daemon=True).start()

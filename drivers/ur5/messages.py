@@ -20,6 +20,17 @@ class SafetyMode(IntEnum):
     FAULT = 9
 
 
+class RuntimeState(IntEnum):
+    """Values of the RTDE variable runtime_state: how the program on the controller stands."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+    RESUMING = 5
+
+
 ROBOT_RUNNING = 7
 
 
@@ -117,7 +128,8 @@ class Sample:
 
     stamp_s: controller clock. arrived_ns: host monotonic clock. tcp_pose: of the active tool
     centre point, UR form; `tcp_is_flange` while our control script sees to it that this is the
-    flange.
+    flange. runtime_state, program_is_ours: how the program on the controller stands, and whose it
+    is.
     """
 
     stamp_s: float
@@ -129,6 +141,8 @@ class Sample:
     tool_speed: Vector
     robot_mode: int
     safety_mode: int
+    runtime_state: int
+    program_is_ours: bool
     move: int
     status: MoveStatus
     detail: str

@@ -37,7 +37,6 @@ class Mover:
         self._watch = watch
         self._record = record
         self._dashboard = Dashboard(config.host)
-        self._uploaded = False
         self._operation = 0
         self._linear = True
         self._braking = False
@@ -85,14 +84,23 @@ class Mover:
 
     def _runs(self) -> bool:
         """Say whether our script runs, not merely some program."""
-        self._uploaded = self._uploaded and bool(self._control.isProgramRunning())
-        self._record.tcp_is_flange = self._uploaded
-        return self._uploaded
+        if self._record.tcp_is_flange and not self._control.isProgramRunning():
+            self._record.tcp_is_flange = False
+        return self._record.tcp_is_flange
 
     def _prepare(self) -> str:
         """Have the script run with our payload, the flange as tool centre point, the watchdog."""
         if self._runs():
             return ""
+        if self._control.isProgramRunning():
+            return "a program runs that is not ours"
+        self._record.preparing = True
+        try:
+            return self._upload()
+        finally:
+            self._record.preparing = False
+
+    def _upload(self) -> str:
         try:
             self._control.reuploadScript()
         except RuntimeError as error:
@@ -103,7 +111,7 @@ class Mover:
                 return "the controller did not start the control script"
             time.sleep(_POLL_S)
         config, self._braking = self._config, False
-        self._uploaded = (
+        self._record.tcp_is_flange = (
             self._control.setTcp([0.0] * 6)
             and self._control.setPayload(config.payload_kg, list(config.payload_cog_m))
             and self._control.setWatchdog(config.watchdog_hz)

@@ -6,7 +6,15 @@ import time
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, NoReturn
 
-from drivers.ur5.messages import Answer, Beat, Command, Farewell, MoveStatus, Sample
+from drivers.ur5.messages import (
+    Answer,
+    Beat,
+    Command,
+    Farewell,
+    MoveStatus,
+    RuntimeState,
+    Sample,
+)
 
 if TYPE_CHECKING:
     from rtde_receive import RTDEReceiveInterface
@@ -19,6 +27,7 @@ VARIABLES = [
     "actual_TCP_speed",
     "robot_mode",
     "safety_mode",
+    "runtime_state",
 ]
 """RTDE variables a sample is made of."""
 
@@ -59,12 +68,14 @@ class Parent:
 class MoveRecord:
     """What the main thread lets the watch thread know.
 
-    now: number, status and detail of the newest move. tcp_is_flange: our script runs.
+    now: number, status and detail of the newest move. tcp_is_flange: our script runs. preparing:
+    it is on its way there.
     """
 
     def __init__(self) -> None:
         self.now: tuple[int, MoveStatus, str] = (0, MoveStatus.NONE, "")
         self.tcp_is_flange = False
+        self.preparing = False
 
     @property
     def moving(self) -> bool:
@@ -83,6 +94,7 @@ class Watch:
         self._receive = receive
         self._parent = parent
         self._record = record
+        self._played = False
         self.newest = self._sample()
 
     def run(self) -> NoReturn:
@@ -96,6 +108,7 @@ class Watch:
             now_s = time.monotonic()
             if self._receive.getTimestamp() != self.newest.stamp_s:
                 self.newest = self._sample()
+                self._note_end(self.newest)
                 self._parent.send(self.newest)
                 spoken_s = now_s
             elif now_s - spoken_s > _BEAT_S:
@@ -103,22 +116,35 @@ class Watch:
                 spoken_s = now_s
             time.sleep(_PERIOD_S)
 
+    def _note_end(self, sample: Sample) -> None:
+        """Note the end of our script: the next one to run may be another's.
+
+        The main thread may be waiting in a call of the vendor's meanwhile.
+        """
+        plays = sample.runtime_state == RuntimeState.PLAYING
+        if self._played and not plays:
+            self._record.tcp_is_flange = False
+        self._played = plays and sample.tcp_is_flange
+
     def _sample(self) -> Sample:
         """Read one package: the getters lock one by one, so an unchanged stamp must frame them."""
         receive = self._receive
         while True:
             stamp_s = receive.getTimestamp()
             move, status, detail = self._record.now
+            tcp_is_flange = self._record.tcp_is_flange
             sample = Sample(
                 stamp_s=stamp_s,
                 arrived_ns=time.monotonic_ns(),
                 tcp_pose=tuple(receive.getActualTCPPose()),
-                tcp_is_flange=self._record.tcp_is_flange,
+                tcp_is_flange=tcp_is_flange,
                 joints_rad=tuple(receive.getActualQ()),
                 joint_speeds_rps=tuple(receive.getActualQd()),
                 tool_speed=tuple(receive.getActualTCPSpeed()),
                 robot_mode=receive.getRobotMode(),
                 safety_mode=receive.getSafetyMode(),
+                runtime_state=receive.getRuntimeState(),
+                program_is_ours=tcp_is_flange or self._record.preparing,
                 move=move,
                 status=status,
                 detail=detail,

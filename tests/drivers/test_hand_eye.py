@@ -151,6 +151,24 @@ def test_views_of_a_single_row_of_corners_do_no_harm():
     assert apart(found.tool_from_camera, true)[0] < 0.001
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_views_of_a_patch_of_the_board_do_not_spoil_the_others(seed):
+    true = mounted([0.02, -0.03, 0.01], [0.004, 0.002, -0.006])
+    rng = np.random.default_rng(seed)
+    views = [
+        replace(view, pixels=view.pixels + rng.normal(0, 0.1, view.pixels.shape))
+        for view in seen_by(true, cameras(20, seed), arm_noise(1e-4, 2e-4, seed))
+    ]
+    patch = (GRID[:, 0] < 0.1) & (GRID[:, 1] < 0.07)
+    some = [only(view, patch) if view.index % 3 == 0 else view for view in views]
+    found, others = calibrate(some), calibrate([view for view in some if view.index % 3])
+    assert len(some[0].pixels) == 6
+    assert found.used.all()
+    assert found.position_std_m < 1.2 * others.position_std_m
+    assert found.turn_std_deg < 1.2 * others.turn_std_deg
+    assert apart(found.tool_from_camera, true)[0] < 3 * found.position_std_m
+
+
 @pytest.mark.parametrize(
     ("poses", "why"),
     [

@@ -124,11 +124,6 @@ def test_numbers_beyond_the_robot_are_refused(make_arm):
         wait_settled(arm, timeout_s=5.0)
 
 
-def test_a_second_driver_is_told_that_the_arm_is_taken(make_arm):
-    with make_arm(), pytest.raises(NotConnectedError, match="already in use"), make_arm():
-        pass
-
-
 def test_seventy_waypoints_take_little_more_than_their_motion(make_arm):
     with make_arm() as arm:
         start = arm.state().pose.base_from_tool0

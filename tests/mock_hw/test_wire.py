@@ -102,6 +102,21 @@ def test_a_slower_stream_is_thinned(fake):
     assert np.median(np.diff(stamps)) == pytest.approx(0.04, abs=0.008)
 
 
+def test_an_input_belongs_to_one_connection_until_that_is_closed(fake):
+    with RtdeReader(fake.host) as other:
+        with RtdeReader(fake.host) as reader:
+            assert reader.ask("I", b"input_int_register_24") == b"\x01INT32"
+            both = b"input_int_register_24,input_double_register_24,"
+            assert reader.ask("I", both) == b"\x02INT32,DOUBLE"
+            wanted = b"input_int_register_24,input_int_register_25"
+            assert other.ask("I", wanted) == b"\x00IN_USE,INT32"
+            assert other.ask("I", b"input_int_register_25") == b"\x01INT32"
+        until = time.perf_counter() + 2.0
+        while (answer := other.ask("I", wanted)) == b"\x00IN_USE,INT32":
+            assert time.perf_counter() < until
+        assert answer == b"\x02INT32,INT32"
+
+
 def test_a_missing_variable_is_named_not_found(fake):
     with RtdeReader(fake.host, version=1) as reader:
         reply = reader.ask("O", b"timestamp,nonsense")

@@ -6,13 +6,15 @@ An e-Series controller stands behind it, and no worker: that one may be missing.
 import importlib.util
 import re
 import time
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 
 import numpy as np
 import pytest
 from live_rig import (
     CANOPY,
+    TIME_SCALE,
     Service,
+    hardware_at,
     problem,
     rig_file,
     served,
@@ -153,6 +155,31 @@ def test_without_a_worker_scans_run_and_their_skeletons_are_pending(shared):
     pending = shared.http.get(f"/v1/scans/{scan_id}/skeleton")
     assert problem(pending, 404) == "skeleton_pending"
     assert absent in pending.json()["detail"]
+
+
+@pytest.mark.usefixtures("shared")  # no worker is started
+def test_a_second_service_is_refused_the_arm_until_the_first_has_ended(tmp_path):
+    with FakeUr(free_host(), time_scale=TIME_SCALE) as controller, ExitStack() as second_runs:
+
+        def before_it(_, camera):
+            return hardware_at(controller.host, camera)
+
+        with served(tmp_path / "first", hardware_at=before_it) as first:
+            wait_for(lambda: first.part("arm")["ready"], "not ready")
+            second = second_runs.enter_context(served(tmp_path / "second", hardware_at=before_it))
+            scan_id = first.start_slowly()
+            taken = (
+                f"arm: ArmTakenError: the controller at {controller.host} is taken: .* end that one"
+            )
+            for answer in (second.http.get("/readyz"), second.post(), second.acknowledge()):
+                assert problem(answer, 503) in ("not_ready", "rig_not_ready")
+                assert re.search(taken, answer.json()["detail"]), answer.text
+            assert not second.part("arm")["ready"]
+            first.wait(scan_id, "done", views=3)
+            assert first.http.get("/readyz").status_code == 200
+
+        wait_for(lambda: second.part("arm")["ready"], "the arm is not given up")
+        second.wait(second.start_slowly(), "done", views=3)
 
 
 def test_a_robot_without_a_camera_starts_nothing_and_says_what_to_do(tmp_path):

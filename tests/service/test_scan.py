@@ -35,7 +35,7 @@ from service.rig import (
 
 LIMITS = Limits(box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1))
 WAYPOINTS = tuple(pose @ invert(TOOL_FROM_CAMERA) for pose in camera_path(10))
-pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
+rtde_control = pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
 
 
 class StillCamera:
@@ -417,6 +417,31 @@ def test_a_hanging_camera_stops_the_scan_and_it_can_go_on(rig, camera):
     rig.acknowledge("plugged in again")
     rig.resume("scan-1")
     assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+
+
+def test_a_scan_that_lost_the_arm_does_not_stop_who_has_it_now(rig, fake, camera, monkeypatch):
+    others = []
+
+    def lost_meanwhile(timeout_s):
+        fake.do("cut_link")
+        while rig.parts()[0].ready:
+            time.sleep(0.01)
+        fake.do("mend_link")
+        others.append(rtde_control.RTDEControlInterface(fake.host))
+        x, y, z, *turn = fake.do("state")["tcp_pose"]
+        assert others[0].moveL([x, y, z - 0.2, *turn], 0.001, 0.5, True)
+        while "ArmTakenError" not in rig.parts()[0].detail:
+            time.sleep(0.01)
+        raise CameraTimeoutError(f"no picture within {timeout_s} s; check the cable")
+
+    monkeypatch.setattr(camera, "grab", lost_meanwhile)
+    rig.start(spec())
+    assert "CameraTimeoutError" in wait_for(rig, "scan-1", ScanState.STOPPED).detail
+    assert fake.do("state")["moving"]
+    assert others[0].isProgramRunning()
+    rig.stop()
+    assert_stands_still(fake)
+    others[0].disconnect()
 
 
 def test_a_controller_that_was_silent_for_a_moment_does_not_finish_its_move(rig, fake):
