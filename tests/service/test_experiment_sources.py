@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
 import sys
-from service.experiment.sources import sources_sha256
-print(sources_sha256(sys.argv[1], sys.argv[2]))
+from service.experiment.rows import experiment_sha256
+print(experiment_sha256(sys.argv[1], sys.argv[2]))
 """
 ROWS = [("recorded", "paper"), ("recorded", "canopy"), ("unet", "paper")]
 
