@@ -4,6 +4,7 @@ import uuid
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 
 from distributed import Client, Future, as_completed, get_worker
 
@@ -17,14 +18,24 @@ CONNECTING = "10s"
 
 
 def rows_there(tasks: Iterable[Task], client: Client) -> Generator[Row, None, None]:
-    """Yield rows as they are made by the workers of a cluster."""
-    run = uuid.uuid4().hex
-    under_way = {
-        client.submit(_row_on_worker, task, key=f"canopy-{run}-{number}"): task
-        for number, task in enumerate(tasks)
-    }
+    """Yield rows as they are made by the workers of a cluster.
+
+    No worker has more than one: all that a worker has is lost when it dies.
+    """
+    run, waiting = uuid.uuid4().hex, iter(tasks)
+    under_way: dict[Future[Row], Task] = {}
+    done = as_completed(loop=client.loop)
     try:
-        for future in as_completed(list(under_way)):
+        while True:
+            # One waits where there is no worker yet.
+            free = max(1, len(client.nthreads())) - len(under_way)
+            for task in islice(waiting, max(0, free)):
+                future = client.submit(_row_on_worker, task, key=f"canopy-{run}-{task.name}")
+                under_way[future] = task
+                done.add(future)
+            if not under_way:
+                return
+            future = next(done)
             yield _row_of(future, under_way.pop(future))
     finally:
         client.cancel(list(under_way))

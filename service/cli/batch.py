@@ -117,6 +117,9 @@ def _run(plan: Batch, engine: Engine) -> list[Row]:
     with row_store(plan.output / STORE) as store, progress_bars() as progress:
         try:
             run(plan, store, engine, _show(progress, progress.add_task("recordings", total=None)))
+        except KeyboardInterrupt:
+            stderr.print("interrupted; the same command goes on where this one stopped")
+            raise
         finally:
             rows = plan.rows(store)
             write_all(plan.output, {TABLE: rows_csv(rows).encode()})
