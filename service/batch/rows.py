@@ -119,7 +119,7 @@ def row_store(path: Path) -> Iterator[RowStore]:
         yield RowStore(path, add_line)
 
 
-def rows_csv(rows: Iterable[Row]) -> str:
+def rows_csv(rows: Iterable[Row]) -> bytes:
     """Return rows as a table."""
     out = io.StringIO()
     names = list(Row(recording="", key="").shown())
@@ -127,4 +127,5 @@ def rows_csv(rows: Iterable[Row]) -> str:
     writer.writeheader()
     for row in rows:
         writer.writerow({**row.shown(), "warnings": "; ".join(row.warnings)})
-    return out.getvalue()
+    # A file may have a name that is no text.
+    return out.getvalue().encode(errors="backslashreplace")

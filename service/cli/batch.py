@@ -74,6 +74,8 @@ def batch(
     """
     if jobs is not None and cluster is not None:
         raise UsageError("--jobs is for this machine; leave it out with --cluster")
+    if weights is not None:
+        weights = weights.absolute()  # The workers of a cluster are in folders of their own.
     processes = default_jobs() if jobs is None else jobs
     require_jobs(processes)
     request = replay_request(
@@ -122,7 +124,7 @@ def _run(plan: Batch, engine: Engine) -> list[Row]:
             raise
         finally:
             rows = plan.rows(store)
-            write_all(plan.output, {TABLE: rows_csv(rows).encode()})
+            write_all(plan.output, {TABLE: rows_csv(rows)})
     return rows
 
 
@@ -135,8 +137,8 @@ def _show(progress: Progress, task: TaskID) -> Callable[[int, int, Row | None], 
             stderr.print(f"{done}/{total} error: {row.error}", style="red", markup=False)
         else:
             stderr.print(
-                f"{done}/{total} {row.recording}: {row.length_m:.1f} m in {row.branches} branches,"
-                f" {row.seconds:.0f} s",
+                f"{done}/{total} {row.recording}: {row.length_m:.1f} m of skeleton in"
+                f" {row.branches} branches, {row.seconds:.0f} s",
                 markup=False,
             )
             for line in row.warnings:

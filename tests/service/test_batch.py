@@ -281,7 +281,7 @@ def test_a_recording_named_twice_is_replayed_once(canopy, orchard, tmp_path):
         (["row1", "--method", "best"], "unknown method 'best'"),
         (["row1", "--method", "mst", "--rooted"], "leave them out with mst"),
         (["row1", "--segmenter", "maskrcnn"], "comes without weights"),
-        (["row1", "--segmenter", "unet", "--weights", "row1/none.pt"], "none.pt"),
+        (["row1", "--segmenter", "unet", "--weights", "row1/none.pt"], "none.json: cannot be read"),
         (["row1", "--cluster", "host"], "--cluster host: no Dask scheduler answers there"),
     ],
 )
