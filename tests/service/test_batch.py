@@ -187,7 +187,11 @@ def running(*arguments):
     """A batch in a process of its own, of two jobs."""
     command = (Path(sys.executable).with_name("canopy"), "batch", "--method", "paper", "--jobs", 2)
     with subprocess.Popen(
-        [*map(str, command), *map(str, arguments)], stderr=subprocess.PIPE, text=True
+        [*map(str, command), *map(str, arguments)],
+        stderr=subprocess.PIPE,
+        text=True,
+        # Tests that run in the background have it ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
         yield process
 
