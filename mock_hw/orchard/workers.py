@@ -71,6 +71,7 @@ def one_thread_each() -> Iterator[None]:
 def begin_work() -> None:
     """Prepare a worker: one thread; gone at once when interrupted, or when its parent is."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
     if parent is None:

@@ -1,9 +1,11 @@
 """Processes that do one task at a time each; if one dies, that costs its task and no other."""
 
 import multiprocessing
-from collections.abc import Callable, Generator, Iterable
-from contextlib import suppress
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from itertools import islice
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Generic, TypeVar
@@ -53,9 +55,23 @@ class _Lane(Generic[T, R]):
     def _start(self) -> None:
         spawn = multiprocessing.get_context("spawn")
         self.connection, theirs = spawn.Pipe()
-        with one_thread_each(), theirs:
+        with one_thread_each(), _interrupts_later(), theirs:
             self._process = spawn.Process(target=_serve, args=(theirs, self._work), daemon=True)
             self._process.start()
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Put Ctrl-C off; processes that start meanwhile do not hear it before they begin to work.
+
+    Until then each would say in forty lines where it was interrupted.
+    """
+    resource_tracker.ensure_running()  # As it starts it lets Ctrl-C through.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(connection: Connection, work: Callable[[T], R]) -> None:
