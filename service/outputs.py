@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from canopy_skel.errors import UsageError
@@ -33,7 +33,7 @@ def write_all(directory: Path, contents: Mapping[str, bytes]) -> list[Path]:
     written = []
     for name, content in contents.items():
         target = directory / name
-        part = directory / f".{name}.part"
+        part = _part(directory, name)
         try:
             part.write_bytes(content)
             os.replace(part, target)
@@ -45,3 +45,13 @@ def write_all(directory: Path, contents: Mapping[str, bytes]) -> list[Path]:
             ) from error
         written.append(target)
     return written
+
+
+def remove_parts(directory: Path, names: Iterable[str]) -> None:
+    """Remove what a process that was killed had begun to write of files of these names."""
+    for name in names:
+        _part(directory, name).unlink(missing_ok=True)
+
+
+def _part(directory: Path, name: str) -> Path:
+    return directory / f".{name}.part"

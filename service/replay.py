@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,6 +22,8 @@ from service.outputs import write_all
 from service.segmenters import NAMES, make_segmenter
 from service.skeletons import document_of
 from service.stopwatch import Stopwatch
+
+_MOST_MAP_MEMORY = 3 << 30
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -95,7 +97,7 @@ def replay(
     with stopwatch("export"):
         contents = _files(path.stem, document, walk, request)
     summary = _summary(recording, document, walk, extraction, stopwatch)
-    contents[f"{path.stem}.summary.json"] = json.dumps(summary, indent=2).encode() + b"\n"
+    contents[_summary_name(path.stem)] = json.dumps(summary, indent=2).encode() + b"\n"
     warnings = list(recording.warnings)
     if not document.branches:
         reasons = Counter(instance.reason for instance in walk.skeletonizer.rejected)
@@ -107,6 +109,32 @@ def replay(
     return ReplayResult(
         files=tuple(write_all(out, contents)), document=document, warnings=tuple(warnings)
     )
+
+
+def map_memory_bytes(available_bytes: int) -> int:
+    """Return how much of the memory that a replay has to itself a likelihood map may take."""
+    return min(available_bytes // 2, _MOST_MAP_MEMORY)
+
+
+def file_names(stem: str, formats: Iterable[str]) -> list[str]:
+    """Return the names of all files that the replay of a recording may write."""
+    return [
+        *(_skeleton_name(stem, one) for one in formats),
+        _overlay_name(stem),
+        _summary_name(stem),
+    ]
+
+
+def _skeleton_name(stem: str, form: str) -> str:
+    return f"{stem}.skeleton.{form}"
+
+
+def _overlay_name(stem: str) -> str:
+    return f"{stem}.overlay.png"
+
+
+def _summary_name(stem: str) -> str:
+    return f"{stem}.summary.json"
 
 
 def _walk_views(
@@ -173,11 +201,11 @@ def _add(walk: _Walk, view: View | RejectedView, stopwatch: Stopwatch) -> None:
 def _files(
     stem: str, document: SkeletonDocument, walk: _Walk, request: ReplayRequest
 ) -> dict[str, bytes]:
-    contents = {f"{stem}.skeleton.{name}": FORMATS[name](document) for name in request.formats}
+    contents = {_skeleton_name(stem, name): FORMATS[name](document) for name in request.formats}
     if walk.picture is not None:
         overlay = draw_overlay(walk.picture, document)
         _, png = cv2.imencode(".png", np.ascontiguousarray(overlay[:, :, ::-1]))
-        contents[f"{stem}.overlay.png"] = png.tobytes()
+        contents[_overlay_name(stem)] = png.tobytes()
     return contents
 
 

@@ -35,11 +35,12 @@ def workers(jobs: int) -> Iterator[ProcessPoolExecutor]:
     Raises:
         RecordingError: one of them was killed.
     """
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     spawn = multiprocessing.get_context("spawn")
     try:
-        with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_work) as pool:
+        with (
+            one_thread_each(),
+            ProcessPoolExecutor(jobs, mp_context=spawn, initializer=begin_work) as pool,
+        ):
             try:
                 yield pool
             except BaseException:
@@ -50,6 +51,15 @@ def workers(jobs: int) -> Iterator[ProcessPoolExecutor]:
             "a process that simulates was killed, perhaps for want of memory; run again to go on,"
             " with fewer --jobs"
         ) from error
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Have processes that are started meanwhile compute on one thread each."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
     finally:
         for name, value in before.items():
             if value is None:
@@ -58,9 +68,10 @@ def workers(jobs: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
-def _begin_work() -> None:
+def begin_work() -> None:
     """Prepare a worker: one thread; gone at once when interrupted, or when its parent is."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -82,12 +93,21 @@ def alone_in(folder: Path) -> Iterator[None]:
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(
-                f"{folder}: another canopy writes there; wait for it, or choose another folder"
-            ) from error
+        hold(descriptor, folder)
         yield
     finally:
         os.close(descriptor)
+
+
+def hold(descriptor: int, path: Path) -> None:
+    """Hold what is open at `path` until it is closed.
+
+    Raises:
+        UsageError: another process holds it.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UsageError(
+            f"{path}: another canopy writes there; wait for it, or choose another folder"
+        ) from error

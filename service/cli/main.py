@@ -5,6 +5,7 @@ import sys
 import typer
 
 from canopy_skel.errors import CanopyError, UsageError
+from service.cli.batch import batch
 from service.cli.calibrate import calibrate
 from service.cli.coco import coco
 from service.cli.doctor import doctor
@@ -33,6 +34,7 @@ app = typer.Typer(
 )
 for verb in (
     replay,
+    batch,
     inspect,
     score,
     recover,

@@ -10,69 +10,62 @@ from rich.progress import Progress
 
 from canopy_skel.cluster import FARTHEST_M
 from canopy_skel.errors import CanopyError, UsageError
-from canopy_skel.exports import FORMATS
-from canopy_skel.pipeline import DEFAULT_METHOD, METHODS
+from canopy_skel.pipeline import DEFAULT_METHOD
+from service.cli.replay_options import (
+    VOXEL_M,
+    Formats,
+    Fragments,
+    Method,
+    Rooted,
+    SegmenterName,
+    Topics,
+    Voxel,
+    Weights,
+    replay_request,
+)
 from service.cli.shell import (
     AsJson,
     Exit,
     Farthest,
     Out,
     complain,
+    overall,
     progress_bars,
     stderr,
-    topic_options,
 )
 from service.doctor import available_memory_bytes
 from service.kernels import compile_kernels
 from service.outputs import require_writable
 from service.replay import ReplayRequest, ReplayResult
 from service.replay import replay as replay_recording
-from service.segmenters import NAMES
-from service.specs import method_config
-
-MOST_MAP_MEMORY = 3 << 30
 
 
 def replay(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="MCAP recordings.")],
     output: Out,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = DEFAULT_METHOD,
-    segmenter: Annotated[str, typer.Option(help=f"One of {', '.join(NAMES)}.")] = "recorded",
-    weights: Annotated[Path | None, typer.Option(help="Weights of the segmenter (.pt).")] = None,
-    voxel: Annotated[float, typer.Option(help="Voxel size of the map in metres.")] = 0.005,
-    formats: Annotated[str, typer.Option(help=f"Of {','.join(FORMATS)}.")] = "json,glb",
-    topic: Annotated[
-        list[str] | None,
-        typer.Option(help="ROLE=NAME, e.g. color_image=/rgb or base_frame=base_link; repeatable."),
-    ] = None,
-    fragments: Annotated[
-        bool, typer.Option(help="Use small wood outside the masks (method canopy).")
-    ] = True,
+    method: Method = DEFAULT_METHOD,
+    segmenter: SegmenterName = "recorded",
+    weights: Weights = None,
+    voxel: Voxel = VOXEL_M,
+    formats: Formats = "json,glb",
+    topic: Topics = None,
+    fragments: Fragments = True,
     farthest: Farthest = FARTHEST_M,
-    rooted: Annotated[
-        bool,
-        typer.Option("--rooted", help="Join everything into one tree, however unsure (canopy)."),
-    ] = False,
+    rooted: Rooted = False,
     as_json: AsJson = False,
 ) -> None:
     """Turn recordings into skeletons, with an overlay picture and a summary for each."""
-    if method in METHODS and method != "canopy" and (rooted or not fragments):
-        raise UsageError(
-            f"--rooted and --no-fragments are for method canopy; leave them out with {method}"
-        )
-    request = ReplayRequest(
-        config=method_config(
-            method,  # type: ignore[arg-type]  # MethodConfig names the known ones
-            voxel,
-            farthest_m=farthest,
-            rooted=rooted,
-            fragments=fragments,
-        ),
+    request = replay_request(
+        method=method,
         segmenter=segmenter,
         weights=weights,
-        formats=tuple(formats.split(",")),
-        topics=topic_options(topic or []),
-        memory_limit_bytes=min(available_memory_bytes() // 2, MOST_MAP_MEMORY),
+        voxel_m=voxel,
+        formats=formats,
+        topics=topic,
+        fragments=fragments,
+        farthest_m=farthest,
+        rooted=rooted,
+        memory_bytes=available_memory_bytes(),
     )
     _require_distinct_stems(recordings)
     require_writable(output)
@@ -81,7 +74,7 @@ def replay(
     codes = [_replay_one(path, output, request, results, quiet=as_json) for path in recordings]
     if as_json:
         typer.echo(json.dumps(results, indent=2))
-    raise typer.Exit(_overall(codes))
+    raise typer.Exit(overall(codes))
 
 
 def _replay_one(
@@ -149,9 +142,3 @@ def _require_distinct_stems(recordings: list[Path]) -> None:
                 f"several recordings are named {stem}: their results would overwrite each other;"
                 " replay them into different folders"
             )
-
-
-def _overall(codes: list[Exit]) -> Exit:
-    if len(set(codes)) == 1:
-        return codes[0]
-    return Exit.PARTIAL

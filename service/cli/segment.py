@@ -9,7 +9,6 @@ import typer
 from canopy_skel.errors import CanopyError, UsageError
 from canopy_skel.segment import Segmenter
 from service.cli.labels import Branch, Coco, Images, LabelMe, Labels
-from service.cli.replay import MOST_MAP_MEMORY
 from service.cli.shell import AsJson, Exit, complain, progress_bars, stderr
 from service.outputs import require_writable
 from service.picture_files import SUFFIXES
@@ -125,6 +124,7 @@ def _evaluated(
     # Imported here: evaluation replays recordings, which takes the whole method to load.
     from service.doctor import available_memory_bytes
     from service.evaluation import Evaluation, evaluate, evaluate_recording
+    from service.replay import map_memory_bytes
     from service.training.user_pictures import UserPictures
 
     for path in sources:
@@ -141,7 +141,7 @@ def _evaluated(
         scores, pace = evaluate(every, made, threshold)
         return [Evaluation(source=str(labels.source), scores=scores, pace=pace, skeleton={})]
     made, threshold = make_for_judging(name, weights)
-    memory = min(available_memory_bytes() // 2, MOST_MAP_MEMORY)
+    memory = map_memory_bytes(available_memory_bytes())
     return [
         evaluate_recording(
             path, made, threshold, name=name, weights=weights, memory_limit_bytes=memory

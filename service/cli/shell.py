@@ -1,6 +1,6 @@
 """What the verbs share: options, exit codes, progress and complaints on stderr."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
@@ -50,6 +50,11 @@ class Exit(IntEnum):
     FAILED = 1
     USAGE = 2
     PARTIAL = 3
+
+
+def overall(codes: Collection[Exit]) -> Exit:
+    """Return the code of several: theirs where they agree."""
+    return next(iter(codes)) if len(set(codes)) == 1 else Exit.PARTIAL
 
 
 def progress_bars() -> Progress:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from service.experiment.orchard import Orchard
 from service.experiment.published import FIGURES, published
-from service.experiment.rows import Row
+from service.experiment.rows import Row, experiment_sha256
 from service.experiment.segmenters import degradation
-from service.experiment.sources import sources_sha256
 from service.experiment.table import Mean, Rows
 
 HEADS = {"precision": "P", "recall": "R", "osr": "OSR"}
@@ -75,7 +74,7 @@ class Report:
             "",
             f"{rows.trees} trees, {len(rows.rows)} rows; settings and code "
             + ", ".join(
-                f"`{name}` {config[:12]} {sources_sha256(self.segmenters[0], name)[:12]}"
+                f"`{name}` {config[:12]} {experiment_sha256(self.segmenters[0], name)[:12]}"
                 for name, config in configs.items()
             )
             + ". Means over topologies ± standard error; every figure is explained in the page on"

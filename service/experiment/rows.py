@@ -1,7 +1,6 @@
 """One row per tree, segmenter and method, kept in a file that any interruption leaves usable."""
 
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,10 +8,12 @@ from pathlib import Path
 
 from canopy_skel.errors import UsageError
 from service.experiment.orchard import Tree
-from service.experiment.sources import sources_sha256
+from service.lines import adding_lines, read_lines
+from service.sources import sources_sha256
 
 Value = float | int | bool | str | None
 _SHORT = 12
+_MADE_BY = "service.experiment.measure"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,9 +59,14 @@ def key_of(tree: Tree, segmenter: str, method: str, config_sha256: str) -> str:
         segmenter,
         method,
         config_sha256[:_SHORT],
-        sources_sha256(segmenter, method)[:_SHORT],
+        experiment_sha256(segmenter, method)[:_SHORT],
     )
     return "/".join(parts)
+
+
+def experiment_sha256(segmenter: str, method: str) -> str:
+    """Return the hash of all code and data that rows of a method and a segmenter follow from."""
+    return sources_sha256(_MADE_BY, segmenter, method)
 
 
 class RowStore:
@@ -74,13 +80,8 @@ class RowStore:
         """
         self._path = path
         self._rows: dict[str, Row] = {}
-        if path.exists():
-            data = path.read_bytes()
-            whole = data[: data.rfind(b"\n") + 1]
-            if len(whole) < len(data):
-                os.truncate(path, len(whole))
-            for number, line in enumerate(whole.splitlines(), start=1):
-                self._read(line, number)
+        for number, line in enumerate(read_lines(path), start=1):
+            self._read(line, number)
 
     def __contains__(self, key: str) -> bool:
         """Whether a row with figures is there; what failed is tried again."""
@@ -93,7 +94,7 @@ class RowStore:
     @contextmanager
     def adding(self) -> Iterator[Callable[[Row], None]]:
         """Open the file for further rows."""
-        with self._path.open("ab") as stream:
+        with adding_lines(self._path) as add_line:
 
             def add(row: Row) -> None:
                 fields = {
@@ -104,9 +105,7 @@ class RowStore:
                     "config_sha256": row.config_sha256,
                     "values": dict(row.values),
                 }
-                stream.write(json.dumps(fields).encode() + b"\n")
-                stream.flush()
-                os.fsync(stream.fileno())
+                add_line(fields)
                 self._rows[row.key] = row
 
             yield add

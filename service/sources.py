@@ -1,4 +1,4 @@
-"""What a row of the experiment follows from: the modules it needs, and the data they read."""
+"""What a row of figures follows from: the modules that make it, and the data they read."""
 
 import ast
 from collections.abc import Iterator
@@ -8,7 +8,6 @@ from importlib.metadata import version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 
-_START = "service.experiment.measure"
 _METHOD_ALONE = {
     "canopy": tuple(
         f"canopy_skel.{name}" for name in ("assemble", "canopy", "confidence", "poses", "wood")
@@ -21,14 +20,15 @@ _SEGMENTER_ALONE = {
 }
 _DATA = {"canopy": "canopy_skel/models", "unet": "canopy_skel/segmenters/unet"}
 _UNCONCERNED = ("drivers.oak", "drivers.ur5")
-_FOLLOWED = ("canopy_skel.", "drivers.", "service.experiment.", "service.segmenters")
+_FOLLOWED = ("canopy_skel.", "drivers.", "service.")
 
 
 @cache
-def sources_sha256(segmenter: str, method: str) -> str:
+def sources_sha256(start: str, segmenter: str, method: str) -> str:
     """Return the hash of the version, and of all code and data that a row depends on.
 
-    Rows stay good when code changes that they do not run: that of another method or segmenter.
+    `start` is the module that makes it. Rows stay good when code changes that they do not run: that
+    of another method or segmenter.
     """
     others = [
         module
@@ -38,7 +38,7 @@ def sources_sha256(segmenter: str, method: str) -> str:
         for module in modules
     ]
     digest = sha256(version("canopy-skel").encode())
-    for module in sorted(_reached((*others, *_UNCONCERNED))):
+    for module in sorted(_reached(start, (*others, *_UNCONCERNED))):
         digest.update(module.encode() + b"\0" + _source(module) + b"\0")
     for name in (method, segmenter):
         for path, data in _data(name):
@@ -46,10 +46,10 @@ def sources_sha256(segmenter: str, method: str) -> str:
     return digest.hexdigest()
 
 
-def _reached(left_out: tuple[str, ...]) -> set[str]:
-    """Return the modules that measuring imports, directly or not, without going into some."""
+def _reached(start: str, left_out: tuple[str, ...]) -> set[str]:
+    """Return the modules that one imports, directly or not, without going into some."""
     found: set[str] = set()
-    ahead = [_START, "service.experiment.segmenters", "service.segmenters"]
+    ahead = [start]
     while ahead:
         module = ahead.pop()
         if module in found or any(f"{module}.".startswith(f"{name}.") for name in left_out):

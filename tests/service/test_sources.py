@@ -1,4 +1,4 @@
-"""Rows of an experiment are made again when, and only when, something they follow from changes."""
+"""Rows are made again when, and only when, something they follow from changes."""
 
 import shutil
 import subprocess
@@ -10,13 +10,18 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
 import sys
-from service.experiment.sources import sources_sha256
-print(sources_sha256(sys.argv[1], sys.argv[2]))
+from service.sources import sources_sha256
+print(sources_sha256(*sys.argv[1:]))
 """
-ROWS = [("recorded", "paper"), ("recorded", "canopy"), ("unet", "paper")]
+EXPERIMENT, BATCH = "service.experiment.measure", "service.batch.work"
+PAPER = (EXPERIMENT, "recorded", "paper")
+CANOPY = (EXPERIMENT, "recorded", "canopy")
+UNET = (EXPERIMENT, "unet", "paper")
+REPLAYED = (BATCH, "recorded", "paper")
+ROWS = [PAPER, CANOPY, UNET, REPLAYED]
 
 
-def hashes(folder: Path) -> dict[tuple[str, str], str]:
+def hashes(folder: Path) -> dict[tuple[str, ...], str]:
     """Return the hash of each of `ROWS` by the packages of a folder."""
     return {
         row: subprocess.run(
@@ -46,17 +51,19 @@ def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("canopy_skel/likelihood.py", {*ROWS}),
         ("canopy_skel/kernels/search.py", {*ROWS}),
-        ("canopy_skel/metrics/scores.py", {*ROWS}),
-        ("canopy_skel/links.py", {("recorded", "canopy")}),
-        ("canopy_skel/models/canopy-confidence.json", {("recorded", "canopy")}),
-        ("canopy_skel/segmenters/unet/grouping.py", {("unet", "paper")}),
-        ("canopy_skel/segmenters/unet/builtin.pt", {("unet", "paper")}),
+        ("canopy_skel/metrics/scores.py", {PAPER, CANOPY, UNET}),
+        ("canopy_skel/links.py", {CANOPY}),
+        ("canopy_skel/models/canopy-confidence.json", {CANOPY}),
+        ("canopy_skel/segmenters/unet/grouping.py", {UNET}),
+        ("canopy_skel/segmenters/unet/builtin.pt", {UNET}),
         ("drivers/ur5/messages.py", set()),
-        ("canopy_skel/exports/gltf.py", set()),
+        ("canopy_skel/exports/gltf.py", {REPLAYED}),
+        ("service/replay.py", {REPLAYED}),
+        ("service/scan.py", set()),
     ],
 )
 def test_a_row_follows_from_the_code_and_the_data_it_runs(
-    copied: Path, file: str, changed: set[tuple[str, str]]
+    copied: Path, file: str, changed: set[tuple[str, ...]]
 ) -> None:
     before = hashes(copied)
     original = (copied / file).read_bytes()
