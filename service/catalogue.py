@@ -7,6 +7,7 @@ One process owns a catalogue at a time. Every method may be called from any thre
 import fcntl
 import json
 import os
+import sqlite3
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -19,7 +20,6 @@ from typing import Any, Self
 import sqlalchemy as sa
 from alembic import command
 from alembic.config import Config
-from sqlalchemy.engine.interfaces import DBAPIConnection
 
 from canopy_skel.errors import UsageError
 from service.outputs import require_writable
@@ -84,6 +84,10 @@ class UsedKey:
     response: Mapping[str, Any]
 
 
+class KeyReusedError(Exception):
+    """An idempotency key came back with another body."""
+
+
 class Catalogue:
     """Entering opens (and where needed makes or migrates) the catalogue in `folder`."""
 
@@ -106,7 +110,8 @@ class Catalogue:
         self.uploads.mkdir(exist_ok=True)
         self._lock = _locked(self._folder / "catalogue.lock")
         self._engine = sa.create_engine(f"sqlite:///{self._folder / 'catalogue.sqlite'}")
-        sa.event.listen(self._engine, "connect", _set_pragmas)
+        sa.event.listen(self._engine, "connect", _set_up)
+        sa.event.listen(self._engine, "begin", _begin)
         with self._engine.begin() as connection:
             config = Config()
             config.set_main_option("script_location", "service:migrations")
@@ -151,7 +156,8 @@ class Catalogue:
                     connection.execute(
                         REVISIONS.delete().where(_is_revision(row.scan_id, row.revision))
                     )
-        for file in (set(self._blobs.iterdir()) - named).union(self.uploads.iterdir()):
+        uploads = filter(Path.is_file, self.uploads.iterdir())
+        for file in (set(self._blobs.iterdir()) - named).union(uploads):
             file.unlink()
         return list(left)
 
@@ -221,6 +227,19 @@ class Catalogue:
             return None
         return UsedKey(body_sha256=row.body_sha256, scan_id=row.scan_id, response=row.response)
 
+    def answer(self, key: str | None, body_sha256: str) -> Mapping[str, Any] | None:
+        """Return what a request with this key was answered, None if there was none.
+
+        Raises:
+            KeyReusedError: the key was used for another body.
+        """
+        used = None if key is None else self.used_key(key)
+        if used is None:
+            return None
+        if used.body_sha256 != body_sha256:
+            raise KeyReusedError(f"this Idempotency-Key was used for scan {used.scan_id}")
+        return used.response
+
     def update(self, status: ScanStatus, recording: Path | None = None) -> None:
         """Note where a scan is now."""
         values = _status_values(status) | {"updated_ns": time.time_ns()}
@@ -238,13 +257,17 @@ class Catalogue:
             row = connection.execute(query).one_or_none()
         return None if row is None else _scan_record(row)
 
-    def scans(self, limit: int, before: str | None = None) -> list[ScanRecord]:
-        """Return up to `limit` scans, newest first; only older ones than scan `before`."""
+    def scans(
+        self, limit: int, before: str | None = None, kind: ScanKind | None = None
+    ) -> list[ScanRecord]:
+        """Return up to `limit` scans, newest first: older than scan `before`, of one kind."""
         place = sa.tuple_(SCANS.c.created_ns, SCANS.c.scan_id)
         query = sa.select(SCANS).order_by(SCANS.c.created_ns.desc(), SCANS.c.scan_id.desc())
         if before is not None:
             mark = sa.select(SCANS.c.created_ns, SCANS.c.scan_id).where(SCANS.c.scan_id == before)
             query = query.where(place < mark.scalar_subquery())
+        if kind is not None:
+            query = query.where(SCANS.c.kind == kind)
         with self.transaction() as connection:
             return [_scan_record(row) for row in connection.execute(query.limit(limit))]
 
@@ -341,7 +364,14 @@ def _locked(path: Path) -> int:
     return descriptor
 
 
-def _set_pragmas(connection: DBAPIConnection, record: object) -> None:
+def _begin(connection: sa.Connection) -> None:
+    connection.exec_driver_sql("BEGIN")
+
+
+def _set_up(connection: sqlite3.Connection, record: object) -> None:
+    # By itself the driver begins no transaction before a change of tables: what is killed in a
+    # migration would have half of it.
+    connection.isolation_level = None
     cursor = connection.cursor()
     for pragma in (
         "journal_mode=WAL",

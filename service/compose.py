@@ -133,6 +133,7 @@ def _source(spec: ScanSpec, path: Path) -> ScanSource:
         config=spec.config,
         segmenter=spec.segmenter,
         recording=lambda: recorded_file(path) or path,
+        replay=not spec.waypoints,
     )
 
 

@@ -248,8 +248,11 @@ class ViewFeeder:
         return self._next_of_earlier(workers)
 
     def _next_of_earlier(self, workers: Sequence[WorkerSeen]) -> Callable[[], None] | None:
-        """Return the next step of the first of the earlier scans, of the others when it is over."""
-        scan = next(iter(self._earlier.values()), None)
+        """Return the next step of the first of the earlier scans, of the others when it is over.
+
+        Replays come last.
+        """
+        scan = min(self._earlier.values(), key=lambda one: one.source.replay, default=None)
         if scan is None:
             return None
         if not scan.listed:

@@ -24,7 +24,7 @@ def incomplete(catalogue: Catalogue, interrupted: Collection[str]) -> Iterator[S
         interrupted: ids of scans that were under way when the service ended; they may have views
             that the catalogue was not told of.
     """
-    scans = (one for one in catalogue.scans(LOOK_BACK) if one.kind is ScanKind.SCAN)
+    scans = catalogue.scans(LOOK_BACK, kind=ScanKind.SCAN)
     for record in reversed([*catalogue.unfinished(ScanKind.REPLAY), *scans]):
         due = record.kind is ScanKind.REPLAY or record.scan_id in interrupted
         if not due and not _lacks_views(catalogue, record):

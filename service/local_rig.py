@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from canopy_skel.errors import RecordingError
 from canopy_skel.geometry import FloatArray
+from canopy_skel.recording.writer import publish
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
 from drivers.protocols import Arm, Camera, ToolPose
@@ -17,6 +19,7 @@ from drivers.waypoints import after, moves_to
 from service.opened import Opened
 from service.rig import (
     FINISHED,
+    NoRoomError,
     PartStatus,
     PlanRefusedError,
     RigBusyError,
@@ -246,16 +249,16 @@ class LocalRig:
         """Keep a recording as that of a new scan id; see `Rig.adopt`."""
         path = self._path(scan_id)
         part = path.with_name(path.name + ".part")
+        path.parent.mkdir(parents=True)
         try:
-            path.parent.mkdir(parents=True)
             try:
                 part.hardlink_to(recording)
-            except OSError:  # it lies on another disk
+            except OSError:  # the disk knows no links, or it is another one
                 shutil.copyfile(recording, part)
-            part.replace(path)
-        except OSError as error:
-            shutil.rmtree(path.parent, ignore_errors=True)
-            raise RigNotReadyError(f"{path}: cannot be written ({error}); make room") from error
+            publish(part, path)
+        except (OSError, RecordingError) as error:
+            shutil.rmtree(path.parent)
+            raise NoRoomError(f"{path}: cannot be written ({error}); make room") from error
 
     def catch_up(self, spec: ScanSpec) -> None:
         """Have the views of an ended scan fed; see `Rig.catch_up`."""

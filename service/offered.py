@@ -23,13 +23,15 @@ Lacking = Mapping[int, Sequence[WorkerSeen]]
 class ScanSource:
     """A scan whose views are to be sent.
 
-    recording: returns where the recording is now (`.part` while it grows).
+    recording: returns where the recording is now (`.part` while it grows). replay: nobody waits
+    beside a tree for it.
     """
 
     scan_id: str
     config: MethodConfig
     segmenter: str
     recording: Callable[[], Path]
+    replay: bool = False
 
 
 @dataclass(kw_only=True, slots=True)

@@ -1,14 +1,33 @@
 """Replays over HTTP: a recording that is there becomes a skeleton, and no arm moves."""
 
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock, Timer
+from typing import Any
 
 from canopy_skel.errors import RecordingError
 from canopy_skel.messages import TOPICS
 from canopy_skel.recording import Recording, read_recording
-from service.catalogue import RevisionRecord
-from service.rig import CAUGHT_UP, FINISHED, RigEvent, ScanState, ScanStatus
+from service.catalogue import Catalogue, RevisionRecord, ScanRecord
+from service.rig import (
+    CAUGHT_UP,
+    FINISHED,
+    Rig,
+    RigError,
+    RigEvent,
+    ScanKind,
+    ScanOverError,
+    ScanSpec,
+    ScanState,
+    ScanStatus,
+    UnknownScanError,
+    status_fields,
+)
+from service.specs import fields_of
+
+_AGAIN_S = 5.0
 
 
 def replayable(path: Path) -> Recording:
@@ -41,26 +60,128 @@ def has_masks(recording: Recording) -> bool:
     return any("instances" in group.refs for group in recording.groups)
 
 
-def _views_of(newest: RevisionRecord | None) -> int:
-    if newest is None:
-        return 0
-    views = json.loads(newest.path.read_bytes())["views"]
-    return int(views["used"]) + len(views["rejected"])
+class Replays:
+    """Replays of recordings. Every method may be called from any thread.
 
-
-def status_after(event: RigEvent, status: ScanStatus, newest: RevisionRecord | None) -> ScanStatus:
-    """Return where a replay is when something was told of it.
-
-    newest: its newest skeleton; views that it uses or rejects are done.
+    tell: takes what happens to them, to be noted; must return at once.
     """
-    if status.state in FINISHED:
+
+    def __init__(self, rig: Rig, catalogue: Catalogue, tell: Callable[[RigEvent], None]) -> None:
+        self._rig = rig
+        self._catalogue = catalogue
+        self._tell = tell
+        self._starting = Lock()
+        self._changing = Lock()
+
+    def start(
+        self,
+        spec: ScanSpec,
+        recording: Recording,
+        key: str | None,
+        body_sha256: str,
+    ) -> Mapping[str, Any]:
+        """Have a recording made into a skeleton and return the status fields.
+
+        The worker turns to it when the scan under way, if there is one, leaves it time. It is
+        noted first: whatever happens then, the next service goes on with it or says why not.
+
+        Args:
+            spec: without waypoints.
+            recording: is kept as that of the replay; the file stays where it is.
+            key: the same key starts it once; None = each request is another.
+            body_sha256: of the request.
+
+        Raises:
+            KeyReusedError: the key was used for another body.
+            NoRoomError: the recording cannot be kept; the key is free.
+        """
+        lost = (line.removeprefix(f"{recording.path.name}: ") for line in recording.warnings)
+        status = ScanStatus(
+            scan_id=spec.scan_id,
+            tree_id=spec.tree_id,
+            state=ScanState.RUNNING,
+            views_done=0,
+            views_total=whole_views(recording),
+            detail="; ".join(lost),
+        )
+        answer = status_fields(status)
+        with self._starting:
+            before = self._catalogue.answer(key, body_sha256)
+            if before is not None:
+                return before
+            request = fields_of(spec)
+            self._catalogue.add_scan(status, request, key, body_sha256, answer, ScanKind.REPLAY)
+            try:
+                self._rig.adopt(spec.scan_id, recording.path)
+            except RigError:
+                self._catalogue.drop_scan(spec.scan_id)
+                raise
+        self._tell(RigEvent(scan_id=spec.scan_id, kind="started"))
+        self.feed(spec)
+        return answer
+
+    def feed(self, spec: ScanSpec) -> None:
+        """Have the worker fed with a recording, unless it is that of a replay that has ended."""
+        with self._changing:
+            record = self._catalogue.scan(spec.scan_id)
+            over = record is None or record.state in FINISHED
+            if not (over and _is_replay(record)):
+                self._rig.catch_up(spec)
+
+    def cancel(self, scan_id: str) -> ScanStatus:
+        """End a replay; its recording stays. Raises ScanOverError."""
+        with self._changing:
+            status = self._status(scan_id)
+            if status.state in FINISHED:
+                raise ScanOverError(f"scan {scan_id} is {status.state.value}; start a new one")
+            status = replace(status, state=ScanState.CANCELLED, detail="cancelled")
+            self._catalogue.update(status)
+            self._rig.leave(scan_id)
+        self._tell(RigEvent(scan_id=scan_id, kind="cancelled"))
         return status
-    done = replace(status, views_done=_views_of(newest))
+
+    def after(self, event: RigEvent) -> ScanStatus:
+        """Note where a replay is when something was told of it, and return that."""
+        with self._changing:
+            status = self._status(event.scan_id)
+            if status.state not in FINISHED:
+                newest = self._catalogue.newest_revision(event.scan_id)
+                status = _status_after(event, status, newest)
+                self._catalogue.update(status)
+        return status
+
+    def tell_again(self, event: RigEvent) -> None:
+        """Have it noted later that a replay is through: nothing else will ever say so."""
+        if event.kind == CAUGHT_UP:
+            again = Timer(_AGAIN_S, self._tell, (event,))
+            again.daemon = True
+            again.start()
+
+    def _status(self, scan_id: str) -> ScanStatus:
+        record = self._catalogue.scan(scan_id)
+        if record is None:
+            raise UnknownScanError(f"there is no scan {scan_id!r}")
+        return record.status
+
+
+def _is_replay(record: ScanRecord | None) -> bool:
+    return record is not None and record.kind is ScanKind.REPLAY
+
+
+def _status_after(event: RigEvent, status: ScanStatus, newest: RevisionRecord | None) -> ScanStatus:
+    """Return where a replay is. newest: its newest skeleton; views it knows are done."""
+    document = {} if newest is None else json.loads(newest.path.read_bytes())
+    views = document.get("views", {"used": 0, "rejected": []})
+    status = replace(status, views_done=views["used"] + len(views["rejected"]))
     if event.kind != CAUGHT_UP:
-        return done
-    if newest is None:
-        why = "no view of it is usable; `canopy inspect` and the worker's log say why"
-        return replace(done, state=ScanState.FAILED, detail=why)
-    refused = event.fields["refused"]
-    detail = f"no worker could take views {refused}" if refused else ""
-    return replace(done, state=ScanState.DONE, detail=detail)
+        return status
+    whole = status.views_done >= status.views_total and not document.get("preview")
+    if whole:
+        return replace(status, state=ScanState.DONE)
+    if event.fields["views"] != status.views_total:
+        why = "its recording cannot be read any more"
+    elif event.fields["refused"]:
+        why = f"no worker could take views {event.fields['refused']}"
+    else:
+        why = "no view of it is usable; `canopy inspect` says why"
+    return replace(status, state=ScanState.FAILED, detail=why)

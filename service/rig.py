@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from canopy_skel.geometry import FloatArray
 from canopy_skel.pipeline import MethodConfig
@@ -66,6 +66,13 @@ class ScanStatus:
     detail: str = ""
 
 
+def status_fields(status: ScanStatus) -> dict[str, Any]:
+    """Return a status ready for JSON."""
+    return {name: getattr(status, name) for name in ScanStatus.__slots__} | {
+        "state": status.state.value
+    }
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WaypointVerdict:
     """Whether a waypoint can be driven to; reason is empty if so."""
@@ -115,6 +122,14 @@ class PlanRefusedError(RigError):
     def __init__(self, message: str, verdicts: Sequence[WaypointVerdict] = ()) -> None:
         super().__init__(message)
         self.verdicts = tuple(verdicts)
+
+
+class ScanOverError(RigError):
+    """The scan has ended; nothing can be done with it any more."""
+
+
+class NoRoomError(RigError):
+    """A recording cannot be kept."""
 
 
 class NotForReplaysError(RigError):
@@ -183,7 +198,7 @@ class Rig(Protocol):
         """Keep a recording from elsewhere as that of a new scan id; the file stays where it is.
 
         Raises:
-            RigNotReadyError: it cannot be kept.
+            NoRoomError: it cannot be kept; nothing is left of it.
         """
         ...
 

@@ -16,7 +16,7 @@ from sqlalchemy.exc import OperationalError, SQLAlchemyError
 from service.bell import Bell
 from service.catalogue import Catalogue, ScanRecord
 from service.incomplete import incomplete
-from service.replays import status_after
+from service.replays import Replays
 from service.rig import (
     FINISHED,
     NotForReplaysError,
@@ -24,24 +24,18 @@ from service.rig import (
     RigError,
     RigEvent,
     ScanKind,
+    ScanOverError,
     ScanSpec,
     ScanState,
     ScanStatus,
     UnknownScanError,
+    status_fields,
 )
 from service.specs import fields_of, spec_from
 
 logger = logging.getLogger(__name__)
 _JOURNAL_TIMEOUT_S = 1.0
 _HOLDING = (ScanState.STOPPED, ScanState.FAILED)
-
-
-class KeyReusedError(Exception):
-    """An idempotency key came back with another body."""
-
-
-class ScanOverError(RigError):
-    """The scan has ended; nothing can be done with it any more."""
 
 
 class Scans:
@@ -59,6 +53,7 @@ class Scans:
         self._refreshing = Lock()
         self._journal = Thread(target=self._write_journal, name="journal", daemon=True)
         self._closing = Event()
+        self.replays = Replays(rig, catalogue, self._events.put)
 
     def __enter__(self) -> Self:
         """Recover the catalogue, follow the rig, and have skeletons made that are not complete."""
@@ -103,54 +98,8 @@ class Scans:
             RigBusyError, RigNotReadyError, PlanRefusedError: nothing moved, the key is free.
         """
         with self._starting:
-            return self._answered(key, body_sha256) or self._start(spec, key, body_sha256)
-
-    def replay(
-        self, spec: ScanSpec, recording: Path, views: int, key: str | None, body_sha256: str
-    ) -> Mapping[str, Any]:
-        """Have a recording made into a skeleton and return the status fields; see `start`.
-
-        The worker turns to it when the scan under way, if there is one, leaves it time.
-
-        Args:
-            spec: without waypoints.
-            recording: is kept as that of the replay; the file stays where it is.
-            views: how many it has.
-            key: None = each request is another.
-            body_sha256: of the request.
-
-        Raises:
-            KeyReusedError: the key was used for another body.
-            RigNotReadyError: the recording cannot be kept; the key is free.
-        """
-        with self._starting:
-            if key is not None and (answer := self._answered(key, body_sha256)):
-                return answer
-            status = ScanStatus(
-                scan_id=spec.scan_id,
-                tree_id=spec.tree_id,
-                state=ScanState.RUNNING,
-                views_done=0,
-                views_total=views,
-            )
-            answer = status_fields(status)
-            self._rig.adopt(spec.scan_id, recording)
-            self.catalogue.add_scan(
-                status, fields_of(spec), key, body_sha256, answer, ScanKind.REPLAY
-            )
-        self._add_event(status, "started", {})
-        self._rig.catch_up(spec)
-        self._bell.ring()
-        return answer
-
-    def _answered(self, key: str, body_sha256: str) -> Mapping[str, Any] | None:
-        """Return what a key was answered before. Raises KeyReusedError."""
-        used = self.catalogue.used_key(key)
-        if used is None:
-            return None
-        if used.body_sha256 != body_sha256:
-            raise KeyReusedError(f"this Idempotency-Key was used for scan {used.scan_id}")
-        return used.response
+            before = self.catalogue.answer(key, body_sha256)
+            return before or self._start(spec, key, body_sha256)
 
     def _start(self, spec: ScanSpec, key: str, body_sha256: str) -> Mapping[str, Any]:
         status = ScanStatus(
@@ -250,13 +199,12 @@ class Scans:
         return self._command(scan_id, self._rig.resume, again)
 
     def cancel(self, scan_id: str) -> ScanStatus:
-        """End a scan; its recording stays. Raises UnknownScanError."""
+        """End a scan or replay; its recording stays. Raises UnknownScanError, ScanOverError."""
+        if self.record(scan_id).kind is ScanKind.REPLAY:
+            return self.replays.cancel(scan_id)
 
         def end(record: ScanRecord) -> ScanStatus:
             status = replace(record.status, state=ScanState.CANCELLED, detail="cancelled")
-            with self._refreshing:  # an event of a replay may just be noted
-                self._rig.leave(scan_id)
-                self.catalogue.update(status)
             self._add_event(status, "cancelled", {})
             return status
 
@@ -294,15 +242,15 @@ class Scans:
                 self.catalogue.update(status)
                 return status
 
+    def _require_arm(self, scan_id: str) -> None:
+        if self.record(scan_id).kind is ScanKind.REPLAY:
+            raise NotForReplaysError(f"scan {scan_id} is a replay: cancel it, or let it be")
+
     def _require_unfinished(self, scan_id: str) -> ScanRecord:
         record = self.record(scan_id)
         if record.state in FINISHED:
             raise ScanOverError(f"scan {scan_id} is {record.state.value}; start a new one")
         return record
-
-    def _require_arm(self, scan_id: str) -> None:
-        if self.record(scan_id).kind is ScanKind.REPLAY:
-            raise NotForReplaysError(f"scan {scan_id} is a replay: cancel it, or let it be")
 
     def _refresh(self, scan_id: str) -> ScanStatus:
         """Note where a scan is; the lock keeps an older answer from overwriting a newer one.
@@ -331,7 +279,7 @@ class Scans:
         for spec in incomplete(self.catalogue, interrupted):
             if self._closing.is_set():
                 return
-            self._rig.catch_up(spec)
+            self.replays.feed(spec)
 
     def _catch_up_journal(self) -> None:
         """Wait until what the rig has told so far is noted, but not for long."""
@@ -350,6 +298,7 @@ class Scans:
             except Exception:
                 # The recording holds the event too; the next ones must still be noted.
                 logger.exception("event not noted kind=%s scan_id=%s", event.kind, event.scan_id)
+                self.replays.tell_again(event)
             self._bell.ring()
 
     def _note(self, event: RigEvent) -> None:
@@ -368,19 +317,9 @@ class Scans:
         skeleton = self._rig.skeleton(event.scan_id)
         if skeleton is not None:
             self.catalogue.add_revision(event.scan_id, skeleton)
-        if record.kind is ScanKind.REPLAY:
-            status = self._refresh_replay(event)
-        else:
-            status = self._refresh(event.scan_id)
+        is_replay = record.kind is ScanKind.REPLAY
+        status = self.replays.after(event) if is_replay else self._refresh(event.scan_id)
         self._add_event(status, event.kind, event.fields)
-
-    def _refresh_replay(self, event: RigEvent) -> ScanStatus:
-        with self._refreshing:
-            status = self.record(event.scan_id).status
-            newest = self.catalogue.newest_revision(event.scan_id)
-            status = status_after(event, status, newest)
-            self.catalogue.update(status)
-        return status
 
     def _add_event(self, status: ScanStatus, kind: str, fields: Mapping[str, object]) -> None:
         data = status_fields(status) | {
@@ -388,10 +327,3 @@ class Scans:
             "fields": json.loads(json.dumps(dict(fields), default=str)),
         }
         self.catalogue.add_event(status.scan_id, kind, data)
-
-
-def status_fields(status: ScanStatus) -> dict[str, Any]:
-    """Return a status ready for JSON."""
-    return {name: getattr(status, name) for name in ScanStatus.__slots__} | {
-        "state": status.state.value
-    }

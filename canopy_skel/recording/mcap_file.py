@@ -10,12 +10,13 @@ import struct
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import zstandard
+from lz4.frame import LZ4FrameDecompressor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -28,6 +29,8 @@ from canopy_skel.errors import RecordingError
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNKS_IN_MEMORY = 4
+MOST_CHUNK_BYTES = 1 << 28
+"""Of a chunk that is read; recorders make them of a few MiB, or of one large picture."""
 # What the parsers of the mcap package and the decompressors (lz4: RuntimeError) raise on damage.
 _DAMAGE = (
     McapError,
@@ -290,7 +293,20 @@ def _records_in(data: memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def _decompress(chunk: Chunk) -> memoryview:
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    """Return what a chunk holds, never more than it says and MOST_CHUNK_BYTES: it may be a bomb."""
+    size = chunk.uncompressed_size
+    if size > MOST_CHUNK_BYTES:
+        raise ValueError(f"it says it holds {size} bytes, more than {MOST_CHUNK_BYTES}")
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    else:
+        data = chunk.data
+    if len(data) != size:
+        raise ValueError(f"it does not hold the {size} bytes that it says")
+    plain = replace(chunk, compression="", data=data)
+    stream, size = get_chunk_data_stream(plain, validate_crc=True)
     return memoryview(stream.read(size) if size else b"")
 
 

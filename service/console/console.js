@@ -172,6 +172,7 @@ $("replay").onchange = () => attempt(async () => {
 });
 $("picture").onerror = () => {
   $("picture").hidden = true;
+  if (isReplay) return;  // its views may bear other numbers
   setTimeout(() => { $("picture").src += ""; }, REFRESH_MS);
 };
 $("picture").onload = () => { $("picture").hidden = false; };

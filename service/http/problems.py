@@ -16,16 +16,18 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from canopy_skel.errors import RecordingError, UsageError
+from service.catalogue import KeyReusedError
 from service.http.requests import UnknownPathError
 from service.rig import (
+    NoRoomError,
     NotForReplaysError,
     PlanRefusedError,
     RigBusyError,
     RigError,
     RigNotReadyError,
+    ScanOverError,
     UnknownScanError,
 )
-from service.scans import KeyReusedError, ScanOverError
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +47,7 @@ _KNOWN: Mapping[type[Exception], tuple[int, str, str]] = {
     KeyReusedError: (422, "idempotency_key_reused", "Idempotency-Key used for another request"),
     UsageError: (422, "bad_argument", "An argument does not fit"),
     RecordingError: (503, "recording_failed", "The recording cannot be used"),
+    NoRoomError: (507, "no_room", "No room for the recording"),
     NotForReplaysError: (409, "is_replay", "Not for a replay"),
     RigNotReadyError: (503, "rig_not_ready", "Arm or camera cannot be used now"),
     RigError: (503, "rig_error", "The rig could not do it"),
@@ -217,6 +220,8 @@ class LastResort:
         if length.isdecimal() and int(length) > self._largest_body:
             title = HTTPStatus(413).phrase
             detail = f"the body has {length} bytes; send at most {self._largest_body}"
+            if request.url.path == REPLAYS_PATH:
+                detail += f", or a recording as {RECORDING_TYPE}"
             raise Problem(413, "content_too_large", title, detail)
 
 

@@ -1,9 +1,8 @@
 """Route of replays: a skeleton of a recording that was sent along, or of one that is here."""
 
+import os
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from secrets import token_hex
@@ -22,7 +21,7 @@ from service.http.problems import RECORDING_TYPE, REPLAYS_PATH, Problem, is_reco
 from service.http.requests import TREE_ID, ReplayBody, replay_spec
 from service.http.scans import Key
 from service.pictures import recorded_file
-from service.replays import has_masks, replayable, whole_views
+from service.replays import has_masks, replayable
 from service.rig import FINISHED
 
 router = APIRouter(tags=["scans"])
@@ -57,9 +56,12 @@ async def start_replay(request: Request, here: Here, idempotency_key: Key = None
     body = _asked(dict(request.query_params))
     if body.scan_id is not None:
         raise _invalid("query.scan_id", "send a recording, or name a scan")
-    with _upload(here.uploads, _length(request)) as file:
+    file = await run_in_threadpool(_take_room, here.uploads, _length(request))
+    try:
         content = await _receive(request, file)
         return await run_in_threadpool(_replay, here, body, file, content, idempotency_key)
+    finally:
+        file.unlink(missing_ok=True)
 
 
 def _asked(given: bytes | dict[str, str]) -> ReplayBody:
@@ -112,7 +114,7 @@ def _replay(
     tree_id = tree_id or (said if re.fullmatch(TREE_ID, said) else "unnamed")
     spec = replay_spec(body, tree_id, "recorded" if masks else "unet")
     digest = sha256(f"{body.model_dump_json()} {content}".encode()).hexdigest()
-    status = here.scans.replay(spec, file, whole_views(recording), key, digest)
+    status = here.scans.replays.start(spec, recording, key, digest)
     return JSONResponse(status, 202, headers={"Location": f"/v1/scans/{status['scan_id']}"})
 
 
@@ -123,30 +125,40 @@ def _length(request: Request) -> int:
     return int(length)
 
 
-@contextmanager
-def _upload(folder: Path, length: int) -> Iterator[Path]:
-    """Give a place for a recording of so many bytes, which goes when this is left."""
+def _take_room(folder: Path, length: int) -> Path:
+    """Return a new file of so many bytes: uploads beside each other see what room is left.
+
+    Raises:
+        Problem: the disk has not enough; there is no file then.
+    """
+    file = folder / f"{token_hex(8)}.mcap"
+    title = "No room for the recording"
     free = shutil.disk_usage(folder).free
     if free - length < ROOM_LEFT_BYTES:
         detail = f"it has {length >> 20} MiB, and {free >> 20} MiB are free, of which"
         detail += f" {ROOM_LEFT_BYTES >> 20} are kept for scans; make room"
-        raise Problem(507, "no_room", "No room for the recording", detail)
-    file = folder / f"{token_hex(8)}.mcap"
+        raise Problem(507, "no_room", title, detail)
     try:
-        yield file
-    finally:
+        with file.open("wb") as stream:
+            if length:
+                os.posix_fallocate(stream.fileno(), 0, length)
+    except OSError as error:
         file.unlink(missing_ok=True)
+        raise Problem(507, "no_room", title, f"it cannot be written: {error.strerror}") from error
+    return file
 
 
 async def _receive(request: Request, file: Path) -> str:
-    """Write the body to a file and return its SHA-256."""
+    """Write the body to a file, durably, and return its SHA-256."""
     digest = sha256()
     title = "The recording did not arrive"
     try:
-        with file.open("wb") as stream:
+        with file.open("r+b") as stream:
             async for piece in request.stream():
                 digest.update(piece)
                 await run_in_threadpool(stream.write, piece)
+            stream.flush()
+            await run_in_threadpool(os.fsync, stream.fileno())
     except OSError as error:
         raise Problem(507, "no_room", title, f"it cannot be written: {error.strerror}") from error
     except ClientDisconnect as error:

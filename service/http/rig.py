@@ -9,8 +9,7 @@ from service.http.access import COMMAND
 from service.http.context import Here
 from service.http.problems import STOP_PATH, Problem
 from service.http.requests import AcknowledgeBody, PlanBody, plan_spec
-from service.rig import PartStatus
-from service.scans import status_fields
+from service.rig import PartStatus, status_fields
 
 router = APIRouter(tags=["rig"])
 stop_router = APIRouter(tags=["rig"])

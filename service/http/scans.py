@@ -18,8 +18,7 @@ from service.http.files import file_response
 from service.http.problems import RECORDING_TYPE, Problem
 from service.http.requests import ScanBody, scan_spec
 from service.pictures import NoPictureError, PictureKind, open_recorded
-from service.rig import FINISHED
-from service.scans import status_fields
+from service.rig import FINISHED, status_fields
 
 router = APIRouter(prefix="/v1/scans", tags=["scans"])
 _LOOK_AGAIN_S = 5.0

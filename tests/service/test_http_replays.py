@@ -92,7 +92,7 @@ def test_it_is_done_when_its_skeleton_is(live):
     ("views", "refused", "state", "detail"),
     [
         (0, (), "failed", "no view of it is usable"),
-        (3, (2,), "done", "no worker could take views [2]"),
+        (3, (2,), "failed", "no worker could take views [2]"),
     ],
 )
 def test_what_was_not_used_is_said(live, views, refused, state, detail):

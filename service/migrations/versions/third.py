@@ -14,5 +14,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Forget it."""
+    """Forget it, and replays: taken for scans, they would hold the arm."""
+    op.execute("DELETE FROM scans WHERE kind = 'replay'")
     op.drop_column("scans", "kind")
