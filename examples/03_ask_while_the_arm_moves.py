@@ -1,7 +1,7 @@
 """A planner asks for the nearest wood while the scan is under way, and believes what is sure.
 
-python examples/03_ask_while_the_arm_moves.py [URL of `canopy serve`]; without one, a simulated rig
-is started for the occasion.
+python examples/03_ask_while_the_arm_moves.py [URL of `canopy serve --sim`]; without a URL, a
+simulated rig is started for the occasion.
 """
 
 import json
@@ -18,7 +18,7 @@ from service.compose import free_port
 from service.scan_client import RefusedError, ScanClient
 
 CANOPY = Path(sys.executable).with_name("canopy")
-QUICKLY = ("--time-scale", "20", "--picture-scale", "0.3", "--leaves", "200")
+QUICKLY = ("--time-scale", "20", "--picture-scale", "0.25", "--leaves", "200")
 GRIPPER_M = {"x": 1.5, "y": 0.1, "z": 0.2}
 SURE = 0.9
 PATIENCE_S = 60.0
@@ -51,7 +51,7 @@ def wait_until_ready(client: ScanClient) -> None:
 
 def scan_and_ask(client: ScanClient) -> None:
     """Start a scan, and ask again with every skeleton that is newer."""
-    body = {"tree_id": "apple-7", "path": "orchard-10", "speed_mps": 0.25}
+    body = {"tree_id": "apple-7", "path": "orchard-10"}
     scan_id = client.start(body, key=str(uuid4()))
     place = "&".join(f"{axis}={value}" for axis, value in GRIPPER_M.items())
     for event in client.follow(scan_id):

@@ -8,7 +8,7 @@ from mock_hw.orchard.simulate import Options, prepare, truth, views
 from service.skeletons import document_of
 
 METHODS: tuple[MethodName, ...] = ("canopy", "paper")
-TREE = Options(species="apple", topology=3, leaf_count=200, camera=scaled(Camera(), 0.5))
+TREE = Options(species="apple", topology=3, leaf_count=200, camera=scaled(Camera(), 0.4))
 
 
 def main() -> None:

@@ -39,6 +39,8 @@ def run(tmp_path):
 
 def test_a_recording_gives_the_bytes_of_canopy_replay(run, tmp_path):
     lines = run("01")
+    replayed = tmp_path / "replayed"
+    replayed.mkdir()
     request = ReplayRequest(
         config=MethodConfig(),
         segmenter="recorded",
@@ -46,11 +48,11 @@ def test_a_recording_gives_the_bytes_of_canopy_replay(run, tmp_path):
         topics=None,
         memory_limit_bytes=1 << 30,
     )
-    replay(ROOT / "recordings/demo_apple.mcap", tmp_path / "replayed", request, lambda *_: None)
+    replay(ROOT / "recordings/demo_apple.mcap", replayed, request, lambda *_: None)
     written = [tmp_path / line for line in lines[-2:]]
     assert [file.suffix for file in written] == [".json", ".glb"]
     for file in written:
-        assert file.read_bytes() == (tmp_path / "replayed" / file.name).read_bytes()
+        assert file.read_bytes() == (replayed / file.name).read_bytes()
     assert f"{len(from_json(written[0].read_bytes()).branches)} branches; the longest:" in lines
 
 
