@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query
 from canopy_skel.document import SkeletonDocument, from_json
 from canopy_skel.geometry import FloatArray
 from service.http.context import Context, Here, KnownScan
+from service.http.problems import Problem
 from service.http.skeletons import no_skeleton_yet
 
 router = APIRouter(prefix="/v1/scans/{scan_id}/skeleton", tags=["skeletons"])
@@ -39,12 +40,27 @@ class Nearest:
 
 
 @router.get("/nearest")
-def nearest(scan_id: KnownScan, x: Metres, y: Metres, z: Metres, here: Here) -> dict[str, Any]:
+def nearest(
+    scan_id: KnownScan,
+    x: Metres,
+    y: Metres,
+    z: Metres,
+    here: Here,
+    min_confidence: Annotated[
+        float, Query(ge=0.0, le=1.0, description="of wood that counts")
+    ] = 0.0,
+) -> dict[str, Any]:
     """Return the point of the newest skeleton's centre lines that is nearest to (x, y, z)."""
     document = _newest(here, scan_id)
     if not len(document.edges):
         raise no_skeleton_yet(here, scan_id)
-    return asdict(nearest_point(document, np.array([x, y, z])))
+    found = nearest_point(document, np.array([x, y, z]), min_confidence)
+    if found is None:
+        detail = (
+            f"revision {document.revision} has no wood of confidence {min_confidence:g} or more"
+        )
+        raise Problem(404, "no_such_wood", "No wood as sure as that", detail)
+    return asdict(found)
 
 
 @router.get("/branches")
@@ -70,19 +86,25 @@ def branches(scan_id: KnownScan, here: Here) -> dict[str, Any]:
     }
 
 
-def nearest_point(document: SkeletonDocument, point_in_base: FloatArray) -> Nearest:
+def nearest_point(
+    document: SkeletonDocument, point_in_base: FloatArray, min_confidence: float = 0.0
+) -> Nearest | None:
     """Return the point of the centre lines that is nearest to a point (3,).
 
-    The document must have an edge.
+    Only edges count whose ends both have the confidence; None if there is none.
     """
-    starts, ends = (document.position[document.edges[:, side]] for side in (0, 1))
+    sure = document.confidence[document.edges].min(axis=1, initial=1.0) >= min_confidence
+    edges = document.edges[sure]
+    if not len(edges):
+        return None
+    starts, ends = (document.position[edges[:, side]] for side in (0, 1))
     along = ends - starts
     length2 = np.maximum(np.sum(along**2, axis=1), np.finfo(np.float64).tiny)
     share = np.clip(np.sum((point_in_base - starts) * along, axis=1) / length2, 0.0, 1.0)
     feet = starts + share[:, None] * along
     distance_m = np.linalg.norm(point_in_base - feet, axis=1)
     edge = int(np.argmin(distance_m))
-    a, b = (int(vertex) for vertex in document.edges[edge])
+    a, b = (int(vertex) for vertex in edges[edge])
     near, far = (a, b) if share[edge] <= 0.5 else (b, a)
     x, y, z = feet[edge].tolist()
     return Nearest(

@@ -1,6 +1,7 @@
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,15 @@ def test_a_catalogue_of_an_earlier_version_is_brought_up_to_date(tmp_path):
         assert catalogue.last_stop() == 0
         catalogue.add_stop()
         assert catalogue.last_stop() == 1
+
+
+def test_a_change_of_tables_is_whole_or_none(catalogue):
+    with suppress(ZeroDivisionError), catalogue.transaction() as connection:
+        connection.execute(sa.text("ALTER TABLE scans ADD COLUMN half INTEGER"))
+        connection.execute(sa.text("DROP TABLE stops"))
+        raise ZeroDivisionError
+    assert catalogue.last_stop() == 0
+    test_the_migrations_make_the_tables_of_the_code(catalogue)
 
 
 def catalogue_at_first(connection):

@@ -104,6 +104,23 @@ def test_no_scan_is_begun_twice_when_a_scan_goes_on_while_others_are_caught_up_o
     del listeners
 
 
+def test_a_replay_comes_last_and_what_is_left_is_not_sent(rig, views):
+    replay = record(rig, views[:3])
+    left = record(rig, views[:3])
+    scan = record(rig, views[:4])
+    rig.feeder.begin(rig.source("under-way"))
+    for name in (replay, left):
+        rig.feeder.leave(name)
+    rig.feeder.catch_up(rig.source(replay, replay=True))
+    rig.feeder.catch_up(rig.source(left, replay=True))
+    rig.feeder.leave(left)
+    rig.start_ready_worker()
+    wait_for(lambda: len(rig.caught_up) == 2)
+    assert rig.caught_up == [(scan, 4, []), (replay, 3, [])]
+    assert rig.feeder.latest_skeleton(replay) == rig.replayed(name=replay)
+    assert left not in {name for name, _ in rig.documents}
+
+
 def test_a_worker_killed_while_it_catches_up_is_followed_by_one_that_does(rig, views):
     first = record(rig, views)
     last = record(rig, views[:3])

@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -35,6 +37,19 @@ def test_the_nearest_wood_and_whether_it_was_seen(pole):
     }
 
 
+def test_a_planner_asks_for_wood_that_is_sure(pole):
+    asked = {"x": 0.3, "y": 0.0, "z": 0.75, "min_confidence": 1.0}
+    assert pole.http.get(f"{pole.path}/nearest", params=asked).json()["distance_m"] == 0.3
+    document = json.loads(skeleton(pole.scan_id, 4))
+    document["vertices"]["confidence"] = [0.9] * 3
+    pole.rig.publish(pole.scan_id, json.dumps(document).encode())
+    wait_until(lambda: pole.http.get(pole.path).headers["canopy-revision"] == "4")
+    refused = problem(pole.http.get(f"{pole.path}/nearest", params=asked), 404, "no_such_wood")
+    assert "revision 4 has no wood of confidence 1 or more" in refused["detail"]
+    asked["min_confidence"] = 1.1
+    problem(pole.http.get(f"{pole.path}/nearest", params=asked), 422, "invalid_request")
+
+
 def test_branches_say_where_they_begin_and_end(pole):
     (trunk,) = pole.http.get(f"{pole.path}/branches").json()["branches"]
     assert (trunk["kind"], trunk["parent"], trunk["length"]) == ("trunk", None, 1.0)
@@ -67,7 +82,7 @@ def test_no_point_of_the_centre_lines_is_nearer(vertices, data):
         edges=np.column_stack([parents, range(1, count)]),
         radius_m=np.full(count, 0.01),
         occluded=np.zeros(count, dtype=np.bool_),
-        confidence=np.ones(count),
+        confidence=np.array([data.draw(st.sampled_from([0.3, 0.8])) for _ in range(count)]),
     )
     document = build_document(
         graph,
@@ -77,9 +92,15 @@ def test_no_point_of_the_centre_lines_is_nearer(vertices, data):
         views_used=1,
     )
     point = np.array(data.draw(st.tuples(COORDINATE, COORDINATE, COORDINATE)))
-    found = nearest_point(document, point)
+    sure = data.draw(st.sampled_from([0.0, 0.5, 0.9]))
+    found = nearest_point(document, point, sure)
+    edges = document.edges[(document.confidence[document.edges] >= sure).all(axis=1)]
+    if found is None:
+        assert len(edges) == 0
+        return
+    assert found.confidence >= sure
     assert found.distance_m == pytest.approx(np.linalg.norm(point - found.position), abs=1e-9)
-    a, b = document.position[document.edges].transpose(1, 0, 2)
+    a, b = document.position[edges].transpose(1, 0, 2)
     samples = np.concatenate([a + share * (b - a) for share in np.linspace(0, 1, 30)])
     assert found.distance_m <= np.linalg.norm(samples - point, axis=1).min() + 1e-9
     assert set(found.vertices) <= set(document.branches[found.branch].vertices)

@@ -9,9 +9,11 @@ from fake_rig import DEMO_RECORDING, FakeRig
 from live_service import problem, read_events, serving, skeleton, wait_until
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from sqlalchemy.exc import OperationalError
 
+from service.catalogue import Catalogue
 from service.http import replays
-from service.rig import CAUGHT_UP, RigNotReadyError
+from service.rig import CAUGHT_UP, NoRoomError
 
 MCAP = {"Content-Type": "application/x-mcap"}
 DEMO = DEMO_RECORDING.read_bytes()
@@ -102,6 +104,46 @@ def test_what_was_not_used_is_said(live, views, refused, state, detail):
     assert detail in status(live, scan_id)["detail"]
 
 
+def test_a_preview_is_not_the_end(live):
+    scan_id = sent(live)
+    preview = json.loads(skeleton(scan_id, 4)) | {"preview": True}
+    live.rig.publish(scan_id, json.dumps(preview).encode())
+    live.rig.tell(scan_id, CAUGHT_UP, views=4, refused=[3])
+    wait_until(lambda: status(live, scan_id)["state"] == "failed")
+
+
+def test_a_recording_that_is_gone_is_told(live):
+    scan_id = sent(live)
+    live.rig.tell(scan_id, CAUGHT_UP, views=0, refused=[])
+    wait_until(lambda: status(live, scan_id)["state"] == "failed")
+    assert status(live, scan_id)["detail"] == "its recording cannot be read any more"
+
+
+def test_what_a_recording_has_lost_is_said(live):
+    told = send(live, DEMO[: len(DEMO) // 2]).json()
+    assert "cut off at byte" in told["detail"]
+    assert "2 whole views were saved" in told["detail"]
+    feed(live, told["scan_id"], 2)
+    live.rig.tell(told["scan_id"], CAUGHT_UP, views=2, refused=[])
+    wait_until(lambda: status(live, told["scan_id"])["state"] != "running")
+
+
+def test_an_end_that_cannot_be_noted_is_noted_later(live, monkeypatch):
+    monkeypatch.setattr("service.replays._AGAIN_S", 0.05)
+    scan_id = sent(live)
+    update, faults = Catalogue.update, iter([OperationalError("disk is full", None, Exception())])
+
+    def fails_once(catalogue, now, *more):
+        if now.state == "done" and (fault := next(faults, None)):
+            raise fault
+        update(catalogue, now, *more)
+
+    monkeypatch.setattr(Catalogue, "update", fails_once)
+    feed(live, scan_id)
+    wait_until(lambda: status(live, scan_id)["state"] == "done")
+    assert next(faults, None) is None
+
+
 def test_the_recording_of_an_ended_scan_is_taken_again(live):
     first = scanned(live)
     answer = live.http.post(
@@ -131,6 +173,10 @@ def test_a_replay_is_cancelled_and_cannot_be_paused(live):
     assert live.http.post(f"/v1/scans/{scan_id}:cancel").json()["state"] == "cancelled"
     assert live.rig.left == [scan_id]
     feed(live, scan_id)  # what was under way
+    ended = sent(live)
+    feed(live, ended)
+    wait_until(lambda: status(live, ended)["state"] == "done")
+    problem(live.http.post(f"/v1/scans/{ended}:cancel"), 409, "scan_over")
     events = live.http.get(f"/v1/scans/{scan_id}/events").text
     assert events.count("cancelled") >= 1
     assert status(live, scan_id)["state"] == "cancelled"
@@ -144,8 +190,9 @@ def test_a_replay_goes_on_in_the_next_service_and_does_not_hold_the_arm(tmp_path
         feed(live, ended)
         wait_until(lambda: status(live, ended)["state"] == "done")
     (tmp_path / "uploads/torn.mcap").write_bytes(b"half")
+    (tmp_path / "uploads/lost+found").mkdir()
     with serving(tmp_path, FakeRig()) as live:
-        assert list((tmp_path / "uploads").iterdir()) == []
+        assert [file.name for file in (tmp_path / "uploads").iterdir()] == ["lost+found"]
         assert status(live, scan_id)["state"] == "running"
         wait_until(lambda: live.rig.to_catch_up == [scan_id])
         assert live.rig.fed[0].config.name == "paper"
@@ -157,8 +204,10 @@ def test_a_replay_goes_on_in_the_next_service_and_does_not_hold_the_arm(tmp_path
 def test_an_upload_leaves_nothing_behind(live, tmp_path):
     sent(live)
     problem(send(live, b"no recording"), 422, "unusable_recording")
-    live.rig.refusal = RigNotReadyError("disk: it is full; make room")
-    problem(send(live, key="k1"), 503, "rig_not_ready")
+    before = live.http.get("/v1/scans").json()
+    live.rig.refusal = NoRoomError("x.mcap: cannot be written; make room")
+    problem(send(live, key="k1"), 507, "no_room")
+    assert live.http.get("/v1/scans").json() == before
     assert list((tmp_path / "uploads").iterdir()) == []
     live.rig.refusal = None
     sent(live, key="k1")  # the key was left free
@@ -258,6 +307,8 @@ def test_requests_that_do_not_fit(idle):
     large = {"Content-Type": "application/x-mcap", "Content-Length": str(2 << 20)}
     answer = idle.http.post("/v1/scans", content=bytes(2 << 20), headers=large)
     problem(answer, 413, "content_too_large")
+    answer = idle.http.post("/v1/replays", content=bytes(2 << 20))
+    assert "application/x-mcap" in problem(answer, 413, "content_too_large")["detail"]
 
 
 def test_a_scan_under_way_cannot_be_replayed(live):

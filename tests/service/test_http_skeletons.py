@@ -199,6 +199,15 @@ def test_scans_without_the_skeleton_of_all_their_views_are_caught_up_on_by_the_n
         assert to_catch_up(live) == [*lacking, torn, under_way]
 
 
+def test_replays_do_not_keep_scans_from_being_caught_up_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.incomplete.LOOK_BACK", 1)
+    with serving(tmp_path) as live:
+        scan_id = finished(live, "k1")
+        replay = live.http.post("/v1/replays", json={"scan_id": scan_id}).json()["scan_id"]
+    with serving(tmp_path, FakeRig()) as live:
+        assert to_catch_up(live) == [scan_id, replay]
+
+
 @pytest.mark.parametrize(
     ("end", "times"),
     [

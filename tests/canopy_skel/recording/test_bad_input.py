@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from mcap.writer import CompressionType
 
 from canopy_skel.document import RejectedView
 from canopy_skel.errors import RecordingError
@@ -17,7 +18,7 @@ from canopy_skel.messages import (
     encode_scores,
     encode_transforms,
 )
-from canopy_skel.recording import TopicOptions, read_recording
+from canopy_skel.recording import TopicOptions, mcap_file, read_recording
 
 COLOR, DEPTH, TF = "/camera/color/image", "/camera/depth/image", "/tf"
 INSTANCES, SCORES = "/camera/branches/instances", "/camera/branches/scores"
@@ -399,3 +400,23 @@ def test_only_a_pair_makes_the_left_camera_the_colour_camera(kit, tmp_path):
     ):
         grey = np.repeat(written.stereo.left_mono[..., None], 3, axis=2)
         kit.assert_same_view(view, replace(written, color_rgb=grey, depth_m=None))
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_chunk_that_holds_too_much_is_damage_and_not_read(
+    kit, depth_only, tmp_path, monkeypatch, compression
+):
+    messages = [m for view in depth_only for m in kit.messages_of(view).values()]
+    path = kit.write_raw(tmp_path / "a.mcap", messages, compression=compression)
+    assert read_recording(path).view_count == len(depth_only)
+    monkeypatch.setattr(mcap_file, "MOST_CHUNK_BYTES", 1000)
+    [damage] = mcap_file.scan_mcap(path).damage
+    assert "more than 1000" in damage
+    monkeypatch.undo()
+    content = bytearray(path.read_bytes())
+    size_at = content.index(compression.name.lower().encode()) - 16
+    said = int.from_bytes(content[size_at : size_at + 8], "little")
+    content[size_at : size_at + 8] = (said // 2).to_bytes(8, "little")
+    path.write_bytes(content)
+    [damage] = mcap_file.scan_mcap(path).damage
+    assert f"does not hold the {said // 2} bytes" in damage
