@@ -249,10 +249,11 @@ class Ur5Arm:
         pending = self._connected().post(Prepare())
         reply = pending.wait(self._config.connect_timeout_s)
         if reply is None:
-            error = self._give_up("did not get the control script to run")
-            if pending.sent:  # the script may run by now, without a watchdog that would end it
-                self._end_program()
-            raise error
+            try:
+                raise self._give_up("did not get the control script to run")
+            finally:
+                if pending.sent:  # the script may run by now, without a watchdog
+                    self._end_program()
         if reply.refusal:
             raise self._why_refused(reply.refusal)
 
