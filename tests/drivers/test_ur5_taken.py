@@ -318,6 +318,7 @@ def test_a_script_whose_driver_process_dies_setting_it_up_is_ended(fake, unwatch
 
 def test_a_script_that_nobody_feeds_or_ends_can_be_stopped(fake, unwatched, monkeypatch):
     monkeypatch.setattr(unwatched, "_end_program", lambda: None)
+    monkeypatch.setattr(unwatched, "_unfed_s", lambda: 0.1)
     target = kill_while_it_sets_up(fake, unwatched)
     reconnected(unwatched)
     with pytest.raises(ArmTakenError, match="or `stop` it"):
