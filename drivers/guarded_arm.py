@@ -85,6 +85,10 @@ class GuardedArm:
         """Stop the arm."""
         self._arm.stop()
 
+    def drop(self) -> None:
+        """Drop the move of the arm."""
+        self._arm.drop()
+
     def acknowledge(self, reason: str) -> None:
         """Acknowledge a stop of the arm."""
         self._arm.acknowledge(reason)

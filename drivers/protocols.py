@@ -168,7 +168,15 @@ class Arm(Protocol):
         ...
 
     def stop(self) -> None:
-        """Brake now and forget the move under way; harmless when nothing moves.
+        """Brake now and forget the move under way, whoever began it; harmless when nothing moves.
+
+        Raises:
+            ArmLinkError: no way to the controller is left; the emergency stop must be used.
+        """
+        ...
+
+    def drop(self) -> None:
+        """Stop what this arm was told to do, where nobody asked: another's motion is left alone.
 
         Raises:
             ArmLinkError: no way to the controller is left; the emergency stop must be used.

@@ -20,7 +20,7 @@ from canopy_skel.errors import CanopyError, RecordingError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.recording import RecordingWriter, carry_over, metadata_of, read_recording
-from drivers.errors import ArmTakenError, DriverError
+from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
 from drivers.protocols import (
     Arm,
@@ -180,27 +180,16 @@ class ScanSession:
             self._end(ScanState.FAILED, self._drop_motion(error))
 
     def _drop_motion(self, error: Exception) -> str:
-        """Stop the arm, whatever the error left of a move; return what the operator must know.
+        """Drop whatever the error left of a move; return what the operator must know.
 
-        Not one that another program has taken since: what moves there is none of this scan's.
+        What another program moves since is none of this scan's.
         """
         detail = f"{type(error).__name__}: {error}"
-        if self._taken():
-            return detail
         try:
-            self._tools.arm.stop()
+            self._tools.arm.drop()
         except DriverError as unstopped:
             return f"{detail}; {unstopped}"
         return detail
-
-    def _taken(self) -> bool:
-        try:
-            self._tools.arm.state()
-        except ArmTakenError:
-            return True
-        except DriverError:
-            return False
-        return False
 
     def _scan(self) -> None:
         if self.path.exists():  # whole, but the service ended before it could say so

@@ -147,22 +147,48 @@ class Ur5Arm:
     def stop(self) -> None:
         """Brake through the child; where that is not confirmed in time, end it and the program.
 
-        Where the arm is another's, or not opened, the program is ended just so: whoever asks for
-        a stop sees an arm that must not move, no matter who moves it.
+        A program of another's is ended over the dashboard, be the arm opened or not: whoever asks
+        for a stop sees an arm that must not move, no matter who moves it.
 
         Raises:
             ArmLinkError: neither way is left.
         """
         link = self._link
-        if link is not None:
-            with self._sending:
-                self._stops += 1
-                pending = link.post(Stop())
-                self._stopped_move = self._move
-            if pending.wait(self._config.stop_timeout_s) is not None:
-                return
-            if link.up:
-                link.kill("did not confirm a stop and was ended")
+        if link is None or not self._brake(link) or self._may_be_moved_by_another():
+            self._stop_program()
+
+    def drop(self) -> None:
+        """Stop like `stop`, but leave the arm alone where another has it or moves it.
+
+        Raises:
+            ArmLinkError: no way to the controller is left.
+        """
+        link = self._link
+        if link is None or (not link.up and isinstance(link.why_down(), ArmTakenError)):
+            return
+        if not self._brake(link):
+            self._stop_program()
+
+    def _brake(self, link: ChildLink) -> bool:
+        """Have the child brake; say whether it has confirmed that. One that has not is ended."""
+        with self._sending:
+            self._stops += 1
+            pending = link.post(Stop())
+            self._stopped_move = self._move
+        if pending.wait(self._config.stop_timeout_s) is not None:
+            return True
+        if link.up:
+            link.kill("did not confirm a stop and was ended")
+        return False
+
+    def _may_be_moved_by_another(self) -> bool:
+        """Say whether a program runs that the child does not stop, or cannot be ruled out."""
+        try:
+            return anothers_program(self._fresh(0)[0])
+        except ArmLinkError:
+            return True
+
+    def _stop_program(self) -> None:
         try:
             self._dashboard.ask("stop")
         except OSError as error:
@@ -182,7 +208,7 @@ class Ur5Arm:
         sample = self._returned()
         if not (self._latch or safety_hold(sample) or power_hold(sample)):
             return
-        self._require_alone(self._unfed_s(), paused_too=False)
+        self._require_alone(self._unfed_s())
         log.info("%s: acknowledged: %s", self._config.host, reason)
         try:
             self._dashboard.ask("stop")
@@ -220,18 +246,23 @@ class Ur5Arm:
         """Have the control script run."""
         self._require_alone(self._unfed_s())
         self._require_remote_control(sample)
-        reply = self._connected().post(Prepare()).wait(self._config.connect_timeout_s)
+        pending = self._connected().post(Prepare())
+        reply = pending.wait(self._config.connect_timeout_s)
         if reply is None:
-            raise self._give_up("did not get the control script to run")
+            try:
+                raise self._give_up("did not get the control script to run")
+            finally:
+                if pending.sent:  # the script may run by now, without a watchdog
+                    self._end_program()
         if reply.refusal:
             raise self._why_refused(reply.refusal)
 
-    def _require_alone(self, patience_s: float, *, paused_too: bool = True) -> None:
+    def _require_alone(self, patience_s: float) -> None:
         """Refuse to replace or end a program that is not ours, and does not end in time."""
-        if not self._wait(lambda sample: not anothers_program(sample, paused_too), patience_s):
+        if not self._wait(lambda sample: not anothers_program(sample), patience_s):
             raise ArmTakenError(
                 f"the controller at {self._config.host} is taken: a program that is not ours runs"
-                " or is paused there; wait for its end, or end it at the pendant"
+                " or is paused there; wait for its end, or `stop` it, or end it at the pendant"
             )
 
     def _unfed_s(self) -> float:
@@ -334,11 +365,12 @@ class Ur5Arm:
 
     # What it means
 
-    def _fresh(self) -> tuple[Sample, int]:
+    def _fresh(self, young_ns: int = _FRESH_NS) -> tuple[Sample, int]:
+        """Return the newest sample if it is young enough, else the next one."""
         link = self._connected()
         with self._arrived:
             newest = self._newest
-            if newest and time.monotonic_ns() - newest[0].arrived_ns < _FRESH_NS:
+            if newest and time.monotonic_ns() - newest[0].arrived_ns < young_ns:
                 return newest
             if link.up:
                 self._arrived.wait_for(

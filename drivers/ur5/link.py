@@ -25,10 +25,11 @@ _BACKOFF_S = (0.05, 0.2, 0.5, 1.0)
 
 
 class Pending:
-    """A command on its way; wait for its reply."""
+    """A command on its way; wait for its reply. Not `sent` where there was no child for it."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, sent: bool) -> None:
         self.number = number
+        self.sent = sent
         self._answered = threading.Event()
         self._reply: Reply | None = None
 
@@ -109,12 +110,13 @@ class ChildLink:
         """Send a request; where there is no child its reply never comes."""
         with self._lock:
             self._number += 1
-            pending = Pending(self._number)
-            if self._child is None or not self._up:
+            child = self._child if self._up else None
+            pending = Pending(self._number, sent=child is not None)
+            if child is None:
                 pending.settle(None)
                 return pending
             self._pending[self._number] = pending
-            self._child.send(Command(self._number, request))
+            child.send(Command(self._number, request))
         return pending
 
     def kill(self, why: str = "") -> None:

@@ -31,6 +31,9 @@ class RuntimeState(IntEnum):
     RESUMING = 5
 
 
+ENDED = (RuntimeState.STOPPING, RuntimeState.STOPPED)
+"""No program runs and none is paused, or not for long."""
+
 ROBOT_RUNNING = 7
 
 
@@ -129,7 +132,7 @@ class Sample:
     stamp_s: controller clock. arrived_ns: host monotonic clock. tcp_pose: of the active tool
     centre point, UR form; `tcp_is_flange` while our control script sees to it that this is the
     flange. runtime_state, program_is_ours: how the program on the controller stands, and whose it
-    is.
+    is; a paused one is ours where ours was seen to run until then.
     """
 
     stamp_s: float

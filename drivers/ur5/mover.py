@@ -59,13 +59,16 @@ class Mover:
             self._follow()
 
     def stop(self) -> None:
-        """Brake and forget the move under way, on the controller too: `play` must not resume it."""
+        """Brake and forget the move under way, on the controller too: `play` must not resume it.
+
+        A program that is not ours is left to the parent, which knows whether somebody asked.
+        """
         under_way = self._record.moving
         if under_way:
             self._record.end(MoveStatus.STOPPED, "stopped on request")
         safe = self._watch.newest.safety_mode in _MAY_MOVE
         if under_way and not (safe and self._runs()):
-            self._dashboard.ask("stop")
+            self._end_ours()
             return
         if not self._runs():
             return
@@ -96,7 +99,10 @@ class Mover:
             return "a program runs that is not ours"
         self._record.preparing = True
         try:
-            return self._upload()
+            refusal = self._upload()
+            if refusal:  # it may start late, or run on: without the watchdog nobody would end it
+                self._dashboard.ask("stop")
+            return refusal
         finally:
             self._record.preparing = False
 
@@ -135,7 +141,7 @@ class Mover:
         if begun:
             return ""
         self._record.end(MoveStatus.NONE)
-        self._dashboard.ask("stop")
+        self._end_ours()
         return "the controller ended its program instead of beginning the move"
 
     def _begin(self, request: MoveLinear | MoveJoints) -> bool:
@@ -181,4 +187,9 @@ class Mover:
     def _interrupt(self, detail: str) -> None:
         """Note the end of a move and have the controller forget it: `play` must not resume it."""
         self._record.end(MoveStatus.INTERRUPTED, detail)
-        self._dashboard.ask("stop")
+        self._end_ours()
+
+    def _end_ours(self) -> None:
+        """End our program unless it has ended: what runs by then is another's."""
+        if self._watch.ours_left:
+            self._dashboard.ask("stop")

@@ -9,7 +9,7 @@ from drivers.errors import (
     SafetyFaultError,
 )
 from drivers.protocols import ArmMode
-from drivers.ur5.messages import ROBOT_RUNNING, RuntimeState, SafetyMode, Sample
+from drivers.ur5.messages import ENDED, ROBOT_RUNNING, SafetyMode, Sample
 
 Hold = tuple[ArmMode, ArmStoppedError]
 
@@ -42,10 +42,6 @@ def power_hold(sample: Sample) -> Hold | None:
     return ArmMode.NOT_POWERED, NotPoweredError(_POWER)
 
 
-def anothers_program(sample: Sample, paused_too: bool) -> bool:
+def anothers_program(sample: Sample) -> bool:
     """Say whether a program that is not ours runs on the controller, or is paused there."""
-    if sample.program_is_ours:
-        return False
-    if sample.runtime_state == RuntimeState.PAUSED:
-        return paused_too
-    return sample.runtime_state not in (RuntimeState.STOPPING, RuntimeState.STOPPED)
+    return not sample.program_is_ours and sample.runtime_state not in ENDED

@@ -7,6 +7,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, NoReturn
 
 from drivers.ur5.messages import (
+    ENDED,
     Answer,
     Beat,
     Command,
@@ -31,6 +32,7 @@ VARIABLES = [
 ]
 """RTDE variables a sample is made of."""
 
+_PAUSED = (RuntimeState.PAUSING, RuntimeState.PAUSED)
 _PERIOD_S = 0.002
 _BEAT_S = 0.05
 
@@ -88,14 +90,19 @@ class MoveRecord:
 
 
 class Watch:
-    """Sends every package of the controller to the parent."""
+    """Sends every package of the controller to the parent.
+
+    ours_left: our script was seen to run or to be set up, and not yet to end: it may be paused, and
+    `play` would go on with it.
+    """
 
     def __init__(self, receive: "RTDEReceiveInterface", parent: Parent, record: MoveRecord) -> None:
         self._receive = receive
         self._parent = parent
         self._record = record
         self._played = False
-        self.newest = self._sample()
+        self.ours_left = False
+        self.newest = self._sample(ours_before=False)
 
     def run(self) -> NoReturn:
         """Watch until the link is lost."""
@@ -107,7 +114,7 @@ class Watch:
                 )
             now_s = time.monotonic()
             if self._receive.getTimestamp() != self.newest.stamp_s:
-                self.newest = self._sample()
+                self.newest = self._sample(self.newest.program_is_ours)
                 self._note_end(self.newest)
                 self._parent.send(self.newest)
                 spoken_s = now_s
@@ -125,14 +132,20 @@ class Watch:
         if self._played and not plays:
             self._record.tcp_is_flange = False
         self._played = plays and sample.tcp_is_flange
+        if sample.runtime_state in ENDED:
+            self.ours_left = False
+        elif sample.program_is_ours:
+            self.ours_left = True
 
-    def _sample(self) -> Sample:
+    def _sample(self, ours_before: bool) -> Sample:
         """Read one package: the getters lock one by one, so an unchanged stamp must frame them."""
         receive = self._receive
         while True:
             stamp_s = receive.getTimestamp()
             move, status, detail = self._record.now
             tcp_is_flange = self._record.tcp_is_flange
+            runtime_state = receive.getRuntimeState()
+            still_ours = ours_before and runtime_state in _PAUSED
             sample = Sample(
                 stamp_s=stamp_s,
                 arrived_ns=time.monotonic_ns(),
@@ -143,8 +156,8 @@ class Watch:
                 tool_speed=tuple(receive.getActualTCPSpeed()),
                 robot_mode=receive.getRobotMode(),
                 safety_mode=receive.getSafetyMode(),
-                runtime_state=receive.getRuntimeState(),
-                program_is_ours=tcp_is_flange or self._record.preparing,
+                runtime_state=runtime_state,
+                program_is_ours=tcp_is_flange or self._record.preparing or still_ours,
                 move=move,
                 status=status,
                 detail=detail,

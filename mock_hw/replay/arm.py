@@ -118,6 +118,10 @@ class ReplayArm:
         with self._lock:
             self._halt()
 
+    def drop(self) -> None:
+        """Stand still at once: no other moves this arm."""
+        self.stop()
+
     def acknowledge(self, reason: str) -> None:
         """Do nothing: nothing holds this arm."""
         with self._lock:

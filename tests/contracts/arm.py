@@ -131,11 +131,12 @@ class ArmContract:
             start.pose.base_from_tool0[2, 3] - 0.2, abs=POSITION_TOLERANCE_M
         )
 
-    def test_stop_ends_a_move_for_good(self, arm):
+    @pytest.mark.parametrize("way", ["stop", "drop"])
+    def test_stop_ends_a_move_for_good(self, arm, way):
         start = arm.state()
         arm.start_move(linear(down(start, 0.25), speed_mps=0.02))
         time.sleep(0.1)
-        arm.stop()
+        getattr(arm, way)()
         assert arm.state().mode is ArmMode.INTERRUPTED
         with pytest.raises(MoveInterruptedError):
             wait_settled(arm, timeout_s=1.0)

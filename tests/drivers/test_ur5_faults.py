@@ -287,11 +287,12 @@ def test_driver_process_killed(fake, moving):
     assert_held_until_acknowledged(fake, arm, target)
 
 
-def test_stop_works_while_the_driver_process_hangs(fake, moving):
+@pytest.mark.parametrize("stop", [Ur5Arm.stop, Ur5Arm.drop])
+def test_stop_works_while_the_driver_process_hangs(fake, moving, stop):
     arm, target = moving
     os.kill(arm._link.pid, signal.SIGSTOP)
     began = time.perf_counter()
-    arm.stop()
+    stop(arm)
     assert time.perf_counter() - began < 1.0
     time.sleep(0.05)
     assert not fake.do("state")["moving"]

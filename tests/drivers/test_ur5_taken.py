@@ -4,15 +4,19 @@ import os
 import signal
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import pytest
 from contracts.arm import down, linear
 
-from drivers.errors import ArmLinkError, ArmTakenError, NotConnectedError
+from drivers.errors import ArmLinkError, ArmTakenError, DriverProcessError, NotConnectedError
 from drivers.protocols import ArmMode, wait_settled
 from drivers.ur5.arm import Ur5Arm
 from drivers.ur5.dashboard import Dashboard
-from drivers.ur5.messages import Ur5Config
+from drivers.ur5.messages import Prepare, RuntimeState, Ur5Config
+from drivers.ur5.mover import Mover
+from drivers.ur5.watch import MoveRecord
 
 NO_WHEEL = "ur-rtde has no wheel for this Python"
 rtde_control = pytest.importorskip("rtde_control", reason=NO_WHEEL)
@@ -186,6 +190,26 @@ def test_whoever_asks_for_a_stop_gets_it(fake, arm, make_arm):
     wait_until(lambda: arm.state().mode is ArmMode.NOT_ACKNOWLEDGED, timeout_s=10.0)
 
 
+@pytest.mark.parametrize("paused", [False, True], ids=["runs", "is paused"])
+def test_a_stop_ends_a_program_that_is_not_ours(fake, arm, paused):
+    target = down(arm.state(), 0.05)
+    upload_move(fake)
+    if paused:
+        Dashboard(fake.host).ask("pause")
+    arm.stop()
+    wait_until(lambda: fake.do("state")["runtime_state"] == "STOPPED", timeout_s=0.2)
+    wait_until(lambda: not fake.do("state")["moving"])
+    arm.start_move(linear(target))
+    assert_arrives(arm, target)
+
+
+def test_what_nobody_asked_for_leaves_a_program_that_is_not_ours_alone(fake, make_arm):
+    with make_arm() as arm:
+        height_m = upload_move(fake)
+        arm.drop()
+    wait_until(lambda: abs(height_of(fake) - height_m) < 1e-6)
+
+
 def test_a_stop_that_reaches_nobody_is_said():
     with pytest.raises(NotConnectedError, match="use the emergency stop"):
         Ur5Arm(Ur5Config(host="127.0.0.1")).stop()
@@ -194,8 +218,9 @@ def test_a_stop_that_reaches_nobody_is_said():
 def test_a_program_that_nobody_looks_after_is_not_replaced(fake, arm):
     target = down(arm.state(), 0.05)
     height_m = upload_move(fake)
+    mend = rf"{fake.host} is taken: .* wait for its end, or `stop` it, or end it at the pendant"
     for asked in (arm.check, lambda: arm.start_move(linear(target))):
-        with pytest.raises(ArmTakenError, match=f"{fake.host} is taken: .* end it at the pendant"):
+        with pytest.raises(ArmTakenError, match=mend):
             asked()
     wait_until(lambda: abs(height_of(fake) - height_m) < 1e-6)
     wait_until(lambda: fake.do("state")["runtime_state"] == "STOPPED")
@@ -223,3 +248,112 @@ def test_an_acknowledgement_does_not_end_the_program_of_another(fake, arm):
     wait_until(lambda: abs(height_of(fake) - height_m) < 1e-6)
     arm.acknowledge("the errand is done")
     assert arm.state().mode is ArmMode.READY
+
+
+def test_an_acknowledgement_does_not_end_the_paused_program_of_another(fake, arm):
+    slowly(arm)
+    Dashboard(fake.host).ask("stop")
+    wait_until(lambda: arm.state().mode is ArmMode.NOT_ACKNOWLEDGED, timeout_s=10.0)
+    upload_move(fake)
+    Dashboard(fake.host).ask("pause")
+    time.sleep(0.1)
+    with pytest.raises(ArmTakenError, match="paused"):
+        arm.acknowledge("looked at the wrong arm")
+    assert fake.do("state")["runtime_state"] == "PAUSED"
+    arm.stop()
+    arm.acknowledge("the errand is called off")
+    assert arm.state().mode is ArmMode.READY
+
+
+def test_a_program_that_follows_ours_at_once_is_not_ended_in_its_place(fake, arm):
+    slowly(arm)
+    time.sleep(0.1)
+    Dashboard(fake.host).ask("stop")
+    wait_until_seen(arm, RuntimeState.STOPPED)
+    height_m = upload_move(fake)
+    wait_until(lambda: arm.state().mode is ArmMode.NOT_ACKNOWLEDGED)
+    wait_until(lambda: abs(height_of(fake) - height_m) < 1e-6)
+
+
+def wait_until_seen(arm, runtime_state):
+    """Return within a millisecond: the driver waits 20 for the cause of an end."""
+    until = time.perf_counter() + 5.0
+    while arm._newest[0].runtime_state != runtime_state:
+        assert time.perf_counter() < until
+        time.sleep(0.0005)
+
+
+def kill_while_it_sets_up(fake, arm):
+    """Kill the driver process when its script plays, but the watchdog is hardly set yet."""
+    target = down(arm.state(), 0.05)
+    with ThreadPoolExecutor(1) as pool:
+        preparing = pool.submit(arm.start_move, linear(target))
+        wait_until_playing(fake)
+        os.kill(arm._link.pid, signal.SIGKILL)
+        with pytest.raises(DriverProcessError):
+            preparing.result()
+    return target
+
+
+def wait_until_playing(fake):
+    until = time.perf_counter() + 5.0
+    while not runs(fake):
+        assert time.perf_counter() < until
+
+
+@pytest.fixture
+def unwatched(fake):
+    """An arm whose watchdog ends nothing while a test runs, even where it was set."""
+    with Ur5Arm(Ur5Config(host=fake.host, watchdog_hz=0.02, stale_after_s=0.8)) as arm:
+        yield arm
+
+
+def test_a_script_whose_driver_process_dies_setting_it_up_is_ended(fake, unwatched):
+    target = kill_while_it_sets_up(fake, unwatched)
+    wait_until(lambda: fake.do("state")["runtime_state"] == "STOPPED")
+    reconnected(unwatched)
+    unwatched.start_move(linear(target))
+    assert_arrives(unwatched, target)
+
+
+def test_a_script_that_nobody_feeds_or_ends_can_be_stopped(fake, unwatched, monkeypatch):
+    monkeypatch.setattr(unwatched, "_end_program", lambda: None)
+    monkeypatch.setattr(unwatched, "_unfed_s", lambda: 0.1)
+    target = kill_while_it_sets_up(fake, unwatched)
+    reconnected(unwatched)
+    with pytest.raises(ArmTakenError, match="or `stop` it"):
+        unwatched.start_move(linear(target))
+    unwatched.stop()
+    unwatched.start_move(linear(target))
+    assert_arrives(unwatched, target)
+
+
+def half_set_up(fake, failing):
+    """A control interface whose script plays but is not set up to the end."""
+
+    def upload():
+        upload_move(fake)
+        if failing == "reuploadScript":
+            raise RuntimeError("timed out")
+
+    return SimpleNamespace(
+        reuploadScript=upload,
+        isProgramRunning=lambda: failing != "isProgramRunning" and runs(fake),
+        setTcp=lambda pose: failing != "setTcp",
+        setPayload=lambda mass_kg, cog_m: failing != "setPayload",
+        setWatchdog=lambda minimum_hz: failing != "setWatchdog",
+    )
+
+
+def runs(fake):
+    return fake.do("state")["runtime_state"] == "PLAYING"
+
+
+@pytest.mark.parametrize(
+    "failing", ["reuploadScript", "isProgramRunning", "setTcp", "setPayload", "setWatchdog"]
+)
+def test_a_script_that_is_not_set_up_to_the_end_is_ended(fake, failing):
+    config = Ur5Config(host=fake.host, script_timeout_s=0.05)
+    mover = Mover(half_set_up(fake, failing), config, watch=None, record=MoveRecord())
+    assert "the control script" in mover.do(1, Prepare())
+    assert fake.do("state")["runtime_state"] == "STOPPED"

@@ -2,6 +2,7 @@
 
 import json
 import re
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -442,6 +443,27 @@ def test_a_scan_that_lost_the_arm_does_not_stop_who_has_it_now(rig, fake, camera
     rig.stop()
     assert_stands_still(fake)
     others[0].disconnect()
+
+
+def test_a_scan_that_fails_does_not_stop_a_program_that_is_not_its_own(rig, fake, camera):
+    def replaced_meanwhile(timeout_s):
+        Dashboard(fake.host).ask("stop")
+        while rig.parts()[0].ready:
+            time.sleep(0.01)
+        x, y, z, *turn = fake.do("state")["tcp_pose"]
+        errand = f"def errand():\n  movel(p{[x, y, z - 0.2, *turn]}, a=0.5, v=0.001)\nend\n"
+        with socket.create_connection((fake.host, 30002)) as link:
+            link.sendall(errand.encode())
+            wait_until_moving(rig, fake)
+        raise CameraTimeoutError(f"no picture within {timeout_s} s; check the cable")
+
+    camera.grab = replaced_meanwhile
+    rig.start(spec())
+    assert "CameraTimeoutError" in wait_for(rig, "scan-1", ScanState.STOPPED).detail
+    time.sleep(0.1)
+    assert fake.do("state")["moving"]
+    rig.stop()
+    assert_stands_still(fake)
 
 
 def test_a_controller_that_was_silent_for_a_moment_does_not_finish_its_move(rig, fake):
