@@ -48,13 +48,14 @@ def test_a_scan_may_say_how_far_its_tree_reaches_for_every_method():
 def test_requests_kept_before_trees_could_be_rooted_are_still_understood():
     spec = scan_spec(ScanBody(tree_id="t", path="one"), PATHS, SpeedCaps())
     fields = fields_of(spec)
-    del fields["rooted"], fields["farthest_m"]
+    del fields["rooted"], fields["farthest_m"], fields["fragments"]
     assert spec_from(spec.scan_id, fields).config == spec.config
 
 
-def test_methods_that_cannot_root_refuse_to():
-    with pytest.raises(ValidationError, match="method paper cannot be rooted; choose canopy"):
-        ScanBody(tree_id="t", path="one", method="paper", rooted=True)
+@pytest.mark.parametrize("asked", [{"rooted": True}, {"fragments": False}])
+def test_what_is_for_method_canopy_is_refused_with_others(asked):
+    with pytest.raises(ValidationError, match="are for method canopy; leave them out with paper"):
+        ScanBody(tree_id="t", path="one", method="paper", **asked)
 
 
 def test_an_unknown_segmenter_is_refused_before_anything_moves():

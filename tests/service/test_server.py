@@ -87,7 +87,7 @@ def test_the_service_ends_in_time_with_open_streams_and_cleans_up(service, by):
 OPERATIONS = """
 GET /healthz | GET /readyz | GET /metrics
 GET /v1/rig | POST /v1/rig:stop | POST /v1/rig:acknowledge
-POST /v1/plans | POST /v1/scans | GET /v1/scans | GET /v1/scans/{scan_id}
+POST /v1/plans | POST /v1/replays | POST /v1/scans | GET /v1/scans | GET /v1/scans/{scan_id}
 POST /v1/scans/{scan_id}:pause | POST /v1/scans/{scan_id}:resume | POST /v1/scans/{scan_id}:cancel
 GET /v1/scans/{scan_id}/events | GET /v1/scans/{scan_id}/recording.mcap
 GET /v1/scans/{scan_id}/views/{index}/color.jpg | GET /v1/scans/{scan_id}/views/{index}/depth.png
