@@ -10,7 +10,7 @@ from typing import Any
 from canopy_skel.errors import RecordingError
 from canopy_skel.messages import TOPICS
 from canopy_skel.recording import Recording, read_recording
-from service.catalogue import Catalogue, RevisionRecord, ScanRecord
+from service.catalogue import Catalogue, RevisionRecord
 from service.rig import (
     CAUGHT_UP,
     FINISHED,
@@ -124,8 +124,7 @@ class Replays:
         """Have the worker fed with a recording, unless it is that of a replay that has ended."""
         with self._changing:
             record = self._catalogue.scan(spec.scan_id)
-            over = record is None or record.state in FINISHED
-            if not (over and _is_replay(record)):
+            if record is None or record.kind is ScanKind.SCAN or record.state not in FINISHED:
                 self._rig.catch_up(spec)
 
     def cancel(self, scan_id: str) -> ScanStatus:
@@ -162,10 +161,6 @@ class Replays:
         if record is None:
             raise UnknownScanError(f"there is no scan {scan_id!r}")
         return record.status
-
-
-def _is_replay(record: ScanRecord | None) -> bool:
-    return record is not None and record.kind is ScanKind.REPLAY
 
 
 def _status_after(event: RigEvent, status: ScanStatus, newest: RevisionRecord | None) -> ScanStatus:
