@@ -14,8 +14,7 @@ from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.messages import Message
 from service.bus import Keys
 from service.envelope import ViewEnvelope, encode_envelope
-from service.offered import Lacking, OfferedScan, OfferedView, ScanSource
-from service.recorded import RecordedViews
+from service.offered import Lacking, Listing, OfferedScan, OfferedView, ScanSource
 from service.rig import PartStatus
 from service.skeleton_cache import SkeletonCache
 from service.worker_watch import WorkerSeen, WorkerWatch
@@ -36,7 +35,8 @@ class ViewFeeder:
 
     A view is sent as it was recorded. It counts as there when a worker's heartbeat lists it, used
     or rejected; it is sent again, from the recording, to a worker that has started since, or that
-    has nothing to do and does not have it. All sending and reading happens in a thread of its own.
+    has nothing to do and does not have it. All sending and reading happens in a thread of its own;
+    an earlier recording, which may be large, is looked through beside it.
 
     The scan under way comes first: somebody waits beside its tree. Only while the workers have all
     of it, and its skeleton is here, earlier scans are caught up on, one after the other: a worker
@@ -63,7 +63,6 @@ class ViewFeeder:
         self._changed = threading.Condition()
         self._current: OfferedScan | None = None
         self._earlier: dict[str, OfferedScan] = {}  # in the order they are caught up on
-        self._recorded = RecordedViews()
         self._asked_s = 0.0
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="view feeder", daemon=True)
@@ -98,7 +97,6 @@ class ViewFeeder:
             self._put_back(but=source.scan_id)
             self._skeletons.forget(source.scan_id)
             self._earlier.pop(source.scan_id, None)
-            self._recorded.forget()  # its recording is about to be replaced if it goes on
             self._current = OfferedScan(source=source)
             self._changed.notify_all()
 
@@ -113,7 +111,7 @@ class ViewFeeder:
         self._keys.view(source.scan_id)
         with self._changed:
             if self._current is None or self._current.source.scan_id != source.scan_id:
-                scan = OfferedScan(source=source, listed=False)
+                scan = OfferedScan(source=source, listing=Listing.DUE)
                 self._earlier.setdefault(source.scan_id, scan)
                 self._changed.notify_all()
 
@@ -255,24 +253,30 @@ class ViewFeeder:
         scan = min(self._earlier.values(), key=lambda one: one.source.replay, default=None)
         if scan is None:
             return None
-        if not scan.listed:
-            return partial(self._list, scan)
+        if scan.listing is not Listing.DONE:
+            return partial(self._look_through, scan) if scan.listing is Listing.DUE else None
         lacking = {} if self._is_covered(scan) else self._lacking(scan, workers)
         if scan.is_over(lacking):
             return partial(self._finish, scan, sorted(lacking))
         index = scan.next_to_send(lacking, EARLIER_IN_FLIGHT)
         return None if index is None else partial(self._send, scan, index)
 
+    def _look_through(self, scan: OfferedScan) -> None:
+        """Have it looked up which views a recording has, while views are sent."""
+        scan.listing = Listing.UNDER_WAY
+        threading.Thread(target=self._list, args=(scan,), name="view lister", daemon=True).start()
+
     def _list(self, scan: OfferedScan) -> None:
         """Look up which views a recording has; one that cannot be read has none."""
         try:
-            groups = self._recorded.look_through(scan.source.recording()).groups
+            groups = scan.recorded.look_through(scan.source.recording()).groups
         except RecordingError as error:
             _log.warning("scan %s: no view of it is sent: %s", scan.source.scan_id, error)
             groups = ()
         with self._changed:
             scan.views = {one.index: OfferedView() for one in groups if not one.partial}
-            scan.listed = True
+            scan.listing = Listing.DONE
+            self._changed.notify_all()
 
     def _finish(self, scan: OfferedScan, refused: Sequence[int]) -> None:
         """Leave an earlier scan, and let the worker drop that one before the scan under way."""
@@ -297,7 +301,7 @@ class ViewFeeder:
                 view=index,
                 config=source.config,
                 segmenter=source.segmenter,
-                messages=one.messages or self._read(source, index),
+                messages=one.messages or _read(scan, index),
             )
             # It may wait for seconds and lose the view even so: hence this thread, and the rest.
             self._session.put(
@@ -307,15 +311,16 @@ class ViewFeeder:
             )
         except (RecordingError, UsageError, zenoh.ZError) as error:
             _log.warning("scan %s: view %d is not sent yet: %s", source.scan_id, index, error)
-            self._recorded.forget()
+            scan.recorded.forget()
             one.put_off()
         else:
             one.mark_sent()
 
-    def _read(self, source: ScanSource, index: int) -> tuple[Message, ...]:
-        try:
-            return self._recorded.messages(source.recording(), index)
-        except RecordingError:
-            # The scan may just have ended, which renames its recording.
-            self._recorded.forget()
-            return self._recorded.messages(source.recording(), index)
+
+def _read(scan: OfferedScan, index: int) -> tuple[Message, ...]:
+    try:
+        return scan.recorded.messages(scan.source.recording(), index)
+    except RecordingError:
+        # The scan may just have ended, which renames its recording.
+        scan.recorded.forget()
+        return scan.recorded.messages(scan.source.recording(), index)

@@ -3,11 +3,13 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from pathlib import Path
 
 from canopy_skel.messages import Message
 from canopy_skel.pipeline import MethodConfig
 from service.heartbeat import Version
+from service.recorded import RecordedViews
 from service.worker_watch import WorkerSeen
 
 MOST_TRIES = 5
@@ -70,16 +72,22 @@ class OfferedView:
         return min(_PATIENCE_S * 2.0**self.tries, _MAX_PATIENCE_S)
 
 
+class Listing(Enum):
+    """Whether the views of a recording are known, or are still to be looked up in it."""
+
+    DUE = auto()
+    UNDER_WAY = auto()
+    DONE = auto()
+
+
 @dataclass(kw_only=True, eq=False, slots=True)
 class OfferedScan:
-    """A scan and the views of it that were offered, by index.
-
-    listed: whether the views are known; they are still to be looked up in the recording if not.
-    """
+    """A scan and the views of it that were offered, by index. recorded: where they are read."""
 
     source: ScanSource
     views: dict[int, OfferedView] = field(default_factory=dict)
-    listed: bool = True
+    listing: Listing = Listing.DONE
+    recorded: RecordedViews = field(default_factory=RecordedViews)
 
     def covered_by(self, skeleton: Version) -> bool:
         """Whether a skeleton is the last one that the views give."""

@@ -20,7 +20,7 @@ class RecordedViews:
         self._known: tuple[_FileId | None, Recording] | None = None
 
     def forget(self) -> None:
-        """Look through the next recording anew; may be called from any thread."""
+        """Look through the next recording anew."""
         self._known = None
 
     def look_through(self, path: Path) -> Recording:

@@ -8,11 +8,11 @@ from canopy_skel.recording.options import ROS2_TOPICS, TopicOptions
 from canopy_skel.recording.reader import (
     Recording,
     TopicSummary,
-    messages_of_view,
     metadata_of,
     read_recording,
 )
 from canopy_skel.recording.recover import RecoverReport, cut_recording, recover
+from canopy_skel.recording.single_view import messages_of_view
 from canopy_skel.recording.writer import RecordingWriter
 
 __all__ = [

@@ -3,6 +3,7 @@
 from collections import Counter
 from contextlib import suppress
 from itertools import pairwise
+from threading import Event
 
 import pytest
 from scenes.bus import Rig, scan_views, wait_for
@@ -119,6 +120,28 @@ def test_a_replay_comes_last_and_what_is_left_is_not_sent(rig, views):
     assert rig.caught_up == [(scan, 4, []), (replay, 3, [])]
     assert rig.feeder.latest_skeleton(replay) == rig.replayed(name=replay)
     assert left not in {name for name, _ in rig.documents}
+
+
+def test_a_view_goes_out_while_a_large_recording_is_looked_through(rig, views):
+    earlier = record(rig, views[:3])
+    rig.feeder.begin(rig.source("under-way"))
+    rig.feeder.leave(earlier)
+    find, looking, looked_through = rig.source(earlier).recording, Event(), Event()
+
+    def found_late():
+        looking.set()
+        assert looked_through.wait(60)
+        return find()
+
+    rig.feeder.catch_up(rig.source(earlier, recording=found_late, replay=True))
+    rig.start_ready_worker()
+    assert looking.wait(20)
+    scan = record(rig, views[:4])
+    assert rig.feeder.flush(20)
+    assert rig.feeder.latest_skeleton(scan) == rig.replayed()
+    assert rig.caught_up == []
+    looked_through.set()
+    wait_for_skeleton(rig, earlier)
 
 
 def test_a_worker_killed_while_it_catches_up_is_followed_by_one_that_does(rig, views):
