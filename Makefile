@@ -37,8 +37,11 @@ demo-replay: $(RUNS)
 	@echo "Its picture:  out/demo_apple.overlay.png"
 
 # What asks nothing of the clock runs on two cores; the rest, on whose time much depends, alone.
-SIDE_BY_SIDE := tests/canopy_skel tests/mock_hw/orchard tests/service/training \
-	tests/service/test_batch.py tests/service/test_experiment.py tests/service/test_sources.py
+SIDE_BY_SIDE := tests/canopy_skel tests/mock_hw/orchard tests/mock_hw/test_motion.py \
+	tests/service/training \
+	$(patsubst %,tests/service/test_%.py,adopt ahead batch calibrate catalogue cli cli_simulate \
+		experiment kernels pixelfit recordings segment segmenter_choice sources training) \
+	$(patsubst %,tests/drivers/test_%.py,clock guarded_arm hand_eye kinematics stereo waypoints)
 
 test: $(READY)
 	@failed=0; \

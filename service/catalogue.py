@@ -83,6 +83,16 @@ class UsedKey:
     scan_id: str
     response: Mapping[str, Any]
 
+    def answer(self, body_sha256: str) -> Mapping[str, Any]:
+        """Return that answer to a request with this body.
+
+        Raises:
+            KeyReusedError: the key was used for another body.
+        """
+        if self.body_sha256 != body_sha256:
+            raise KeyReusedError(f"this Idempotency-Key was used for scan {self.scan_id}")
+        return self.response
+
 
 class KeyReusedError(Exception):
     """An idempotency key came back with another body."""
@@ -234,11 +244,7 @@ class Catalogue:
             KeyReusedError: the key was used for another body.
         """
         used = None if key is None else self.used_key(key)
-        if used is None:
-            return None
-        if used.body_sha256 != body_sha256:
-            raise KeyReusedError(f"this Idempotency-Key was used for scan {used.scan_id}")
-        return used.response
+        return None if used is None else used.answer(body_sha256)
 
     def update(self, status: ScanStatus, recording: Path | None = None) -> None:
         """Note where a scan is now."""

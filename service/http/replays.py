@@ -3,9 +3,11 @@
 import os
 import re
 import shutil
+from collections.abc import AsyncIterator, Mapping
 from hashlib import sha256
 from pathlib import Path
 from secrets import token_hex
+from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
@@ -56,10 +58,14 @@ async def start_replay(request: Request, here: Here, idempotency_key: Key = None
     body = _asked(dict(request.query_params))
     if body.scan_id is not None:
         raise _invalid("query.scan_id", "send a recording, or name a scan")
+    key = idempotency_key
+    used = await run_in_threadpool(here.scans.catalogue.used_key, key) if key else None
+    if used is not None:  # it is here, and there may be no room for it a second time
+        return _accepted(used.answer(_digest(body, await _hashed(request))))
     file = await run_in_threadpool(_take_room, here.uploads, _length(request))
     try:
         content = await _receive(request, file)
-        return await run_in_threadpool(_replay, here, body, file, content, idempotency_key)
+        return await run_in_threadpool(_replay, here, body, file, content, key)
     finally:
         file.unlink(missing_ok=True)
 
@@ -113,8 +119,14 @@ def _replay(
     said = recording.metadata.get("tree_id", "")
     tree_id = tree_id or (said if re.fullmatch(TREE_ID, said) else "unnamed")
     spec = replay_spec(body, tree_id, "recorded" if masks else "unet")
-    digest = sha256(f"{body.model_dump_json()} {content}".encode()).hexdigest()
-    status = here.scans.replays.start(spec, recording, key, digest)
+    return _accepted(here.scans.replays.start(spec, recording, key, _digest(body, content)))
+
+
+def _digest(body: ReplayBody, content: str) -> str:
+    return sha256(f"{body.model_dump_json()} {content}".encode()).hexdigest()
+
+
+def _accepted(status: Mapping[str, Any]) -> JSONResponse:
     return JSONResponse(status, 202, headers={"Location": f"/v1/scans/{status['scan_id']}"})
 
 
@@ -151,16 +163,31 @@ def _take_room(folder: Path, length: int) -> Path:
 async def _receive(request: Request, file: Path) -> str:
     """Write the body to a file, durably, and return its SHA-256."""
     digest = sha256()
-    title = "The recording did not arrive"
+    title = "No room for the recording"
     try:
         with file.open("r+b") as stream:
-            async for piece in request.stream():
+            async for piece in _pieces(request):
                 digest.update(piece)
                 await run_in_threadpool(stream.write, piece)
             stream.flush()
             await run_in_threadpool(os.fsync, stream.fileno())
     except OSError as error:
         raise Problem(507, "no_room", title, f"it cannot be written: {error.strerror}") from error
-    except ClientDisconnect as error:
-        raise Problem(400, "upload_broken_off", title, "send it again, to its end") from error
     return digest.hexdigest()
+
+
+async def _hashed(request: Request) -> str:
+    """Return the SHA-256 of the body."""
+    digest = sha256()
+    async for piece in _pieces(request):
+        digest.update(piece)
+    return digest.hexdigest()
+
+
+async def _pieces(request: Request) -> AsyncIterator[bytes]:
+    try:
+        async for piece in request.stream():
+            yield piece
+    except ClientDisconnect as error:
+        title = "The recording did not arrive"
+        raise Problem(400, "upload_broken_off", title, "send it again, to its end") from error

@@ -224,9 +224,13 @@ def test_an_upload_that_breaks_off_leaves_nothing(live, tmp_path, caplog):
     assert "unexpected error" not in caplog.text
 
 
-def test_there_must_be_room_for_it(live, monkeypatch):
+def test_there_must_be_room_for_it_the_first_time(live, monkeypatch):
+    first = send(live, key="k1").json()
     monkeypatch.setattr(replays, "ROOM_LEFT_BYTES", 1 << 60)
     problem(send(live), 507, "no_room")
+    assert send(live, key="k1").json() == first
+    problem(send(live, key="k1", tree_id="another"), 422, "idempotency_key_reused")
+    assert len(live.rig.adopted) == 1
 
 
 def renamed(names, profile=""):
