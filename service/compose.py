@@ -29,6 +29,7 @@ from service.broadcast import Broadcast
 from service.bus import Keys, open_session
 from service.catalogue import Catalogue
 from service.feeder import ViewFeeder
+from service.heartbeat import Version
 from service.http.access import Access
 from service.http.requests import SpeedCaps
 from service.local_rig import LocalRig, RigParts
@@ -174,8 +175,9 @@ def composed(
             )
         )
 
-        def announce(scan_id: str, document: bytes) -> None:
-            rig.announce(scan_id, "skeleton", {"bytes": len(document)})
+        def announce(scan_id: str, document: bytes, version: Version) -> None:
+            about = {"revision": version.revision, "preview": not version.exact}
+            rig.announce(scan_id, "skeleton", {"bytes": len(document), **about})
 
         def announce_caught_up(scan_id: str, views: int, refused: Sequence[int]) -> None:
             rig.announce(scan_id, CAUGHT_UP, {"views": views, "refused": list(refused)})

@@ -14,6 +14,7 @@ from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.messages import Message
 from service.bus import Keys
 from service.envelope import ViewEnvelope, encode_envelope
+from service.heartbeat import Version
 from service.offered import Lacking, Listing, OfferedScan, OfferedView, ScanSource
 from service.rig import PartStatus
 from service.skeleton_cache import SkeletonCache
@@ -45,8 +46,8 @@ class ViewFeeder:
     Args:
         session: an open bus session.
         keys: of the rig.
-        on_skeleton: called with scan id and document (JSON) when a newer one has come, from a
-            thread of zenoh's; must return at once.
+        on_skeleton: called with scan id, document (JSON) and version when a newer one has come,
+            from a thread of zenoh's; must return at once.
         on_caught_up: called with scan id, number of views and the views that no worker took
             when nothing more is sent of an earlier scan, from the feeder's thread.
     """
@@ -55,7 +56,7 @@ class ViewFeeder:
         self,
         session: zenoh.Session,
         keys: Keys,
-        on_skeleton: Callable[[str, bytes], None] = lambda scan_id, document: None,
+        on_skeleton: Callable[[str, bytes, Version], None] = lambda *found: None,
         on_caught_up: Callable[[str, int, Sequence[int]], None] = lambda *told: None,
     ) -> None:
         self._session, self._keys, self._on_skeleton = session, keys, on_skeleton
@@ -168,8 +169,8 @@ class ViewFeeder:
         with self._changed:
             self._changed.notify_all()
 
-    def _came(self, scan_id: str, document: bytes) -> None:
-        self._on_skeleton(scan_id, document)
+    def _came(self, scan_id: str, document: bytes, version: Version) -> None:
+        self._on_skeleton(scan_id, document, version)
         self._notify()
 
     def _complete(self) -> bool:

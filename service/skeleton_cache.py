@@ -18,12 +18,12 @@ _log = logging.getLogger(__name__)
 class SkeletonCache:
     """Keeps the newest document of the last scans.
 
-    `on_skeleton(scan_id, document)` is called for every newer one, from zenoh's thread: it must
-    return at once.
+    `on_skeleton(scan_id, document, version)` is called for every newer one, from zenoh's thread: it
+    must return at once.
     """
 
     def __init__(
-        self, session: zenoh.Session, keys: Keys, on_skeleton: Callable[[str, bytes], None]
+        self, session: zenoh.Session, keys: Keys, on_skeleton: Callable[[str, bytes, Version], None]
     ) -> None:
         self._session, self._keys, self._on_skeleton = session, keys, on_skeleton
         self._lock = threading.Lock()
@@ -69,4 +69,4 @@ class SkeletonCache:
             self._latest.move_to_end(scan_id)
             if len(self._latest) > SCANS_KEPT:
                 self._latest.popitem(last=False)
-        self._on_skeleton(scan_id, data)
+        self._on_skeleton(scan_id, data, version)

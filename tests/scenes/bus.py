@@ -69,7 +69,7 @@ class Rig:
             ViewFeeder(
                 self._wrap(self.session),
                 self.keys,
-                lambda *found: self.documents.append(found),
+                lambda *found: self.documents.append(found[:2]),
                 lambda *told: self.caught_up.append(told),
             )
         )

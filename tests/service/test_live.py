@@ -24,6 +24,7 @@ from live_rig import (
     served,
     wait_until_ready,
 )
+from live_service import read_events
 
 from canopy_skel.recording import read_recording
 from mock_hw.fake_ur.process import FakeUr, free_host
@@ -53,6 +54,9 @@ def test_live_and_replayed_skeletons_are_the_same_bytes(rig, tmp_path):
     assert live == rig.replayed(scan_id, tmp_path)
     answer = rig.http.get(f"/v1/scans/{scan_id}/skeleton.glb")
     assert answer.content[:4] == b"glTF"
+    with rig.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
+        told = [event["data"] for event in read_events(stream) if event["event"] == "skeleton"]
+    assert told[-1]["fields"] == {"revision": 10, "preview": False, "bytes": len(live)}
 
 
 def test_replays_give_the_bytes_that_the_command_line_gives(rig, tmp_path):
