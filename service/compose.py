@@ -177,7 +177,7 @@ def composed(
 
         def announce(scan_id: str, document: bytes, version: Version) -> None:
             about = {"revision": version.revision, "preview": not version.exact}
-            rig.announce(scan_id, "skeleton", {"bytes": len(document), **about})
+            rig.announce(scan_id, "skeleton", {**about, "bytes": len(document)})
 
         def announce_caught_up(scan_id: str, views: int, refused: Sequence[int]) -> None:
             rig.announce(scan_id, CAUGHT_UP, {"views": views, "refused": list(refused)})

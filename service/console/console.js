@@ -141,8 +141,10 @@ function showSkeleton(skeleton) {
 }
 
 function showEvent(kind, data) {
-  const fields = Object.keys(data.fields).length ? JSON.stringify(data.fields) : "";
-  $("events").prepend(element("li", `${data.at.slice(11, 23)} ${kind} ${fields} ${data.detail}`));
+  const fields = Object.entries(data.fields).map(([name, value]) =>
+    `${name} ${typeof value === "object" ? JSON.stringify(value) : value}`);
+  const what = [kind, fields.join(", "), data.detail].filter(Boolean).join(" · ");
+  $("events").prepend(element("li", `${data.at.slice(11, 23)} ${what}`));
   showStatus(data);
 }
 
