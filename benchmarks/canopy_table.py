@@ -4,7 +4,9 @@ python benchmarks/canopy_table.py REC... --output docs/results/canopy.md --cache
 """
 
 import argparse
+import csv
 import json
+import re
 import time
 from pathlib import Path
 
@@ -87,21 +89,23 @@ Made by `benchmarks/canopy_table.py` from simulated trees. Models were fitted an
 set on other trees (the models' file names them; no walnut is among them). Columns are explained
 in [metrics.md](../metrics.md); ms/view is CPU time of the last view and the skeleton after it
 (there was one after the view before, as in a live scan), the best of four times, without
-segmentation and the network's maps; other work on the machine adds to it. The number behind a
-recording is the share of its truth that no mask covers, which decides its class: up to .375 light,
-over .625 heavy. Masks are the simulated ones; fragments are told by colour, by the built-in network
-and by what lies around each pixel, and simulated pictures are not an orchard's: the rows "masks
-only" do not depend on them.
-(Network and models learned from pictures of the renderer of those numbered 005 and 006, of other
-trees; the four without a number were made by another.)
+segmentation and the network's maps; other work on the machine adds to it. The share of its truth
+that no mask covers decides the class of a recording: up to .375 light, over .625 heavy. Masks are
+the simulated ones; fragments are told by colour, by the built-in network and by what lies around
+each pixel, and simulated pictures are not an orchard's: the rows "masks only" do not depend on
+them. (Network and models learned from pictures of the renderer of those that bear a number, of
+other trees; those without a number were made by another renderer.)
 Rows with *worse masks* (a quarter dropped, a fifth false) and with the masks of the built-in
 *unet* show what a real detector would leave of it; they use the confidences for learned masks.
-Depth counts up to 3 m, so trees of the next row do not.
+Depth counts up to 3 m, so trees of the next row do not. Each recording by itself:
+[canopy-recordings.csv](canopy-recordings.csv).
 
 ![masks only](canopy-reliability-masks.svg) ![with fragments](canopy-reliability-fragments.svg)
 
 """
 CLASSES = ("light", "medium", "heavy")
+NUMBERED = re.compile(r"(.+_\d+)_fd\d")
+"""What `canopy simulate` calls its recordings: the tree, and its foliage density."""
 
 
 def main():
@@ -118,15 +122,16 @@ def main():
     for path in arguments.recordings if arguments.worse else ():
         if class_of(results[path.stem]["unmasked"]) == "medium":
             results[path.stem] = figures_of(path, arguments.cache, [*RUNS, *WORSE])
-    page = (
-        "\n".join([*goal_table(results), *class_tables(results), *recording_table(results)]) + "\n"
-    )
+    page = "\n".join([*sample(results), *goal_table(results), *class_tables(results)])
     if arguments.output:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(INTRODUCTION + page)
         for name in ("masks", "fragments"):
             picture = arguments.output.with_name(f"{arguments.output.stem}-reliability-{name}.svg")
             picture.write_text(reliability_diagram(results, name))
+        write_recordings(
+            arguments.output.with_name(f"{arguments.output.stem}-recordings.csv"), results
+        )
     print(page)
 
 
@@ -238,38 +243,54 @@ def reliability_diagram(results, run_name):
     )
 
 
+def sample(results):
+    """Yield what was measured."""
+    numbered = {stem: NUMBERED.fullmatch(stem) for stem in sorted(results)}
+    trees = sorted({match[1] for match in numbered.values() if match})
+    others = [stem for stem, match in numbered.items() if not match]
+    yield (
+        f"{len(results)} recordings: {len(results) - len(others)} of {len(trees)} trees"
+        f" ({', '.join(trees)}), and {', '.join(others)}."
+    )
+    yield ""
+
+
 def goal_table(results):
     """Yield a table of what was asked, what was measured, and whether that is enough."""
     yield "## Goals"
     yield ""
-    yield "Asked → measured, mean of the class; × is times what `paper` has."
+    yield (
+        "Asked → measured, mean of the class ± its standard error; × is times the mean that `paper`"
+        " has."
+    )
     yield ""
     yield "| | " + " | ".join(CLASSES) + " |"
     yield "|---|" + "---|" * len(CLASSES)
-    means = {}
-    for name in CLASSES:
-        chosen = [r for r in results.values() if class_of(r["unmasked"]) == name]
-        means[name] = {run_name: mean_figures(chosen, run_name) for run_name in RUNS}
+    chosen = {
+        name: [r for r in results.values() if class_of(r["unmasked"]) == name] for name in CLASSES
+    }
     for sign, table in (("≥", GOALS), ("≤", LIMITS)):
         for run_name, figure, asked in table:
             cells = [
-                goal_cell(means[name], run_name, figure, limit, sign)
+                goal_cell(chosen[name], run_name, figure, limit, sign)
                 for name, limit in zip(CLASSES, asked, strict=True)
             ]
             yield f"| {LABELS[run_name]}: {FIGURES[figure]} | " + " | ".join(cells) + " |"
     yield ""
 
 
-def goal_cell(means, run_name, figure, limit, sign):
-    value, paper = means[run_name][figure], means["paper"][figure]
-    if limit is None or value is None:
+def goal_cell(results, run_name, figure, limit, sign):
+    values = [r[run_name][figure] for r in results if r[run_name][figure] is not None]
+    if limit is None or not values:
         return ""
-    asked = float(limit)
-    if isinstance(limit, str):
-        value, limit = value / paper, f"{limit} ×"
-    good = value >= asked if sign == "≥" else value <= asked
+    value, asked = np.mean(values), float(limit)
     digits = 0 if figure == "view_ms" else 3
-    return f"{sign} {limit} → {value:.{digits}f} {'reached' if good else '**missed**'}"
+    measured = f"{value:.{digits}f} ± {np.std(values, ddof=1) / len(values) ** 0.5:.{digits}f}"
+    if isinstance(limit, str):
+        value /= mean_figures(results, "paper")[figure]
+        limit, measured = f"{limit} ×", f"{value:.2f}"
+    good = value >= asked if sign == "≥" else value <= asked
+    return f"{sign} {limit} → {measured} {'reached' if good else '**missed**'}"
 
 
 def class_tables(results):
@@ -293,13 +314,18 @@ def mean_figures(results, run_name):
     return means
 
 
-def recording_table(results):
-    yield "## Each recording"
-    yield ""
-    yield from header("recording, method")
-    for stem, result in sorted(results.items()):
-        for run_name in RUNS:
-            yield row(f"{stem} ({result['unmasked']:.2f}), {LABELS[run_name]}", result[run_name])
+def write_recordings(path, results):
+    """Write the figures of each recording and run as CSV."""
+    with path.open("w", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["recording", "unmasked", "run", *FIGURES])
+        for stem, result in sorted(results.items()):
+            for run_name in [name for name in RUNS | WORSE if name in result]:
+                figures = [
+                    "" if result[run_name][figure] is None else f"{result[run_name][figure]:.4f}"
+                    for figure in FIGURES
+                ]
+                table.writerow([stem, f"{result['unmasked']:.3f}", LABELS[run_name], *figures])
 
 
 def header(first):
