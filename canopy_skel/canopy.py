@@ -27,6 +27,7 @@ from canopy_skel.pieces import PieceConfig
 from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
 from canopy_skel.segment import BranchMask
 from canopy_skel.slivers import inside_thicker, on_axis
+from canopy_skel.trunks import onto_trunks
 from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
@@ -162,7 +163,8 @@ class CanopyScan:
             view=view,
             fragment=fragment,
         ).chosen(probability >= limit)
-        seen = on_axis(seen)
+        outlines = [self._seen[index].outlines for index in sorted(self._seen)]
+        seen = on_axis(onto_trunks(seen, outlines, self.evidence))
         seen = seen.chosen(~inside_thicker(seen))
         fused = fuse(seen, self.config.fusion)
         corrections = pose_corrections(seen, fused, self.config.poses)
