@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -95,7 +96,7 @@ class McapFile:
 
     def attachment(self, ref: AttachmentRef) -> bytes:
         """Read the data of an attachment."""
-        with open_recording(self.path) as stream:
+        with _disk_errors(self.path), open_recording(self.path) as stream:
             return bytes(Attachment.read(_fields(_record_at(stream, ref.record_offset))).data)
 
 
@@ -105,7 +106,7 @@ def scan_mcap(path: Path) -> McapFile:
     Raises:
         RecordingError: no such file, not readable, or not MCAP.
     """
-    with open_recording(path) as stream:
+    with _disk_errors(path), open_recording(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         magic = stream.read(len(MCAP0_MAGIC))
         if not magic or not MCAP0_MAGIC.startswith(magic):
@@ -127,9 +128,22 @@ def open_recording(path: Path) -> BinaryIO:
     except IsADirectoryError as error:
         raise RecordingError(f"{path}: is a folder; name the MCAP file in it") from error
     except OSError as error:
-        raise RecordingError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
-        ) from error
+        raise _unreadable(path, error) from error
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """A file on a bad disk opens well, and fails where it is read."""
+    try:
+        yield
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> RecordingError:
+    return RecordingError(
+        f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
+    )
 
 
 class _Walk:
@@ -241,10 +255,12 @@ class MessageReader:
         """Return the data of a message.
 
         Raises:
-            RecordingError: the file has changed or vanished since it was scanned.
+            RecordingError: the file has changed or vanished since it was scanned, or the disk
+                does not give it.
         """
         try:
-            return self._read(ref)
+            with _disk_errors(self._path):
+                return self._read(ref)
         except _DAMAGE as error:
             raise RecordingError(f"{self._path}: changed while it was read ({error})") from error
 

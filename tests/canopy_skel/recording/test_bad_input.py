@@ -84,6 +84,19 @@ def test_a_folder_is_no_recording(tmp_path):
         read_recording(tmp_path)
 
 
+def test_a_disk_that_does_not_give_what_it_has(kit, tmp_path):
+    """The memory of this process opens well and cannot be read at its beginning: EIO."""
+    (tmp_path / "bad.mcap").symlink_to("/proc/self/mem")
+    with pytest.raises(RecordingError, match=r"bad\.mcap: cannot be read \(Input/output error\)"):
+        read_recording(tmp_path / "bad.mcap")
+    recording = read_recording(kit.write(tmp_path / "turned_bad.mcap"))
+    recording.path.unlink()
+    recording.path.symlink_to("/proc/self/mem")
+    for ask in (lambda: recording.view(0), lambda: recording.ground_truth):
+        with pytest.raises(RecordingError, match=r"turned_bad\.mcap: cannot be read"):
+            ask()
+
+
 @pytest.mark.parametrize(
     ("content", "text"), [(b"", "is empty"), (b"#ROSBAG V2.0\n" * 9, "is not an MCAP file")]
 )
