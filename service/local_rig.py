@@ -287,7 +287,10 @@ class LocalRig:
         """
         before = self._sessions.get(spec.scan_id)
         session = self._session_for(spec, views_before, before[1].exposed_ns if before else {})
-        session.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            session.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RigNotReadyError(f"disk: {_unwritable(session.path.parent, error)}") from error
         self._sessions[spec.scan_id] = (spec, session)
         try:
             if self._stops != stops:
@@ -374,8 +377,12 @@ class LocalRig:
         return PartStatus(name="camera", ready=not detail, detail=detail)
 
     def _disk_status(self) -> PartStatus:
-        self._parts.data.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(self._parts.data).free
+        try:
+            self._parts.data.mkdir(parents=True, exist_ok=True)
+            free = shutil.disk_usage(self._parts.data).free
+        except OSError as error:
+            detail = _unwritable(self._parts.data, error)
+            return PartStatus(name="disk", ready=False, detail=detail)
         detail = "" if free >= ENOUGH_DISK_BYTES else f"only {free >> 20} MiB free; make room"
         return PartStatus(name="disk", ready=not detail, detail=detail)
 
@@ -387,6 +394,10 @@ class LocalRig:
 
 def _not_ready(error: DriverError) -> RigNotReadyError:
     return RigNotReadyError(f"arm: {type(error).__name__}: {error}")
+
+
+def _unwritable(path: Path, error: OSError) -> str:
+    return f"{path}: cannot be written ({error.strerror}); check the disk"
 
 
 def _trouble(device: Opened) -> str:

@@ -20,6 +20,7 @@ from canopy_skel.errors import CanopyError, RecordingError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.recording import RecordingWriter, carry_over, metadata_of, read_recording
+from canopy_skel.recording.writer import disk_errors
 from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
 from drivers.protocols import (
@@ -170,7 +171,8 @@ class ScanSession:
             self._scan()
         except ScanInterruptedError:
             self._end(self._wanted or ScanState.PAUSED, "")
-        except (DriverError, CanopyError, PictureRefusedError) as error:
+        # A disk can refuse anything at any time; mended, it lets the scan go on.
+        except (DriverError, CanopyError, PictureRefusedError, OSError) as error:
             if self._wanted is None:
                 self._end(ScanState.STOPPED, self._drop_motion(error))
             else:  # the interruption makes the driver complain of the move it cut short
@@ -211,7 +213,8 @@ class ScanSession:
         ) as writer:
             if source is not None:
                 indices = carry_over(source, writer)
-                source.unlink()
+                with disk_errors(source):
+                    source.unlink()
                 self._take_over(indices)
             self._note(writer, "running", views_done=len(self._done))
             try:
@@ -337,10 +340,14 @@ def set_aside(path: Path) -> Path | None:
     """Put what an earlier session left of a recording aside, to be carried over; None if nothing.
 
     A file that is aside already was not carried over to the end; it holds all that its copy does.
+
+    Raises:
+        RecordingError: the disk does not let it; what there is stays.
     """
     part, aside = path.with_name(path.name + ".part"), path.with_name(path.name + ".aside")
-    if aside.exists():
-        part.unlink(missing_ok=True)
-    elif part.exists():
-        part.rename(aside)
-    return aside if aside.exists() else None
+    with disk_errors(path):
+        if aside.exists():
+            part.unlink(missing_ok=True)
+        elif part.exists():
+            part.rename(aside)
+        return aside if aside.exists() else None

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Literal, Self
@@ -57,10 +57,12 @@ class RecordingWriter:
 
     def __enter__(self) -> Self:
         """Open the file and write the metadata."""
-        self._stream = open_new(self._path, self._part)
-        self._writer = start_writer(self._stream, compression=self._compression)
-        self._writer.add_metadata(METADATA_RECORD, self._metadata)
-        self._sync()
+        with disk_errors(self._path), ExitStack() as opened:
+            self._stream = opened.enter_context(open_new(self._path, self._part))
+            self._writer = start_writer(self._stream, compression=self._compression)
+            self._writer.add_metadata(METADATA_RECORD, self._metadata)
+            self._sync()
+            opened.pop_all()
         return self
 
     def __exit__(
@@ -70,7 +72,7 @@ class RecordingWriter:
         trace: TracebackType | None,
     ) -> None:
         """Finish and rename; after an error only close what is there."""
-        with _disk_errors(self._path), self._stream:
+        with disk_errors(self._path), self._stream:
             if kind is None:
                 self._writer.finish()
             else:
@@ -107,7 +109,7 @@ class RecordingWriter:
         if unknown:
             raise UsageError(f"{min(unknown)} is not one of {', '.join(TOPICS)}")
         self._indices |= indices
-        with _disk_errors(self._path):
+        with disk_errors(self._path):
             for message in messages:
                 self._add(message)
             self._writer.flush()
@@ -121,14 +123,14 @@ class RecordingWriter:
 
     def write_journal(self, message: Message) -> None:
         """Write an entry of the journal that is encoded already."""
-        with _disk_errors(self._path):
+        with disk_errors(self._path):
             self._add(message)
             self._writer.flush()
             self._sync()
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Attach a file."""
-        with _disk_errors(self._path):
+        with disk_errors(self._path):
             self._writer.flush()
             self._writer.add_attachment(0, 0, name, media_type, data)
             self._sync()
@@ -200,7 +202,7 @@ def open_new(path: Path, part: Path, *, over_leftover: bool = False) -> BinaryIO
 
 def publish(part: Path, path: Path) -> None:
     """Give a finished file its name, durably."""
-    with _disk_errors(path):
+    with disk_errors(path):
         part.rename(path)
         if hasattr(os, "O_DIRECTORY"):
             folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
@@ -211,7 +213,8 @@ def publish(part: Path, path: Path) -> None:
 
 
 @contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
+def disk_errors(path: Path) -> Iterator[None]:
+    """Make a RecordingError, which names the file and the mend, of what a disk refuses."""
     try:
         yield
     except OSError as error:

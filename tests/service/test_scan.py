@@ -1,11 +1,13 @@
 """Scans through the real ur-rtde client against the fake controller."""
 
+import errno
 import json
 import re
 import socket
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -299,6 +301,41 @@ def test_a_cancelled_scan_keeps_its_views_and_does_not_go_on(rig):
         rig.resume("scan-1")
 
 
+@pytest.mark.parametrize("step", ["rename", "unlink", "exists"])
+def test_a_disk_that_went_read_only_stops_the_scan_and_costs_nothing(rig, monkeypatch, step):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    before = rig.pause("scan-1").views_done
+
+    def refused(path, *more, **options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, step, refused)
+        rig.resume("scan-1")
+        until = time.perf_counter() + 10
+        while rig.status("scan-1").state is ScanState.RUNNING:
+            assert time.perf_counter() < until
+        detail = rig.status("scan-1").detail
+        assert rig.status("scan-1").state is ScanState.STOPPED
+    assert "Read-only file system" in detail
+    assert step == "exists" or re.search(r"/scan-1\.mcap\S*: cannot be written .* check", detail)
+    with pytest.raises(RigNotReadyError, match="acknowledge"):
+        rig.resume("scan-1")
+    rig.acknowledge("remounted")
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    assert len(views_of(rig, "scan-1")) == 4 > before
+
+
+def test_a_folder_that_went_away_makes_the_disk_not_ready(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: Path("/nowhere/at/all").stat())
+    part = {part.name: part for part in rig.parts()}["disk"]
+    assert not part.ready
+    assert f"{tmp_path}: cannot be written (No such file or directory); check" in part.detail
+
+
 def test_a_second_scan_is_refused(rig):
     rig.start(spec())
     with pytest.raises(RigBusyError, match="scan scan-1 is under way"):
@@ -360,7 +397,7 @@ def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, m
 
 def test_a_scan_that_cannot_begin_leaves_the_rig_free(rig, tmp_path):
     (tmp_path / "scans").write_bytes(b"no folder")
-    with pytest.raises(NotADirectoryError):
+    with pytest.raises(RigNotReadyError, match=r"disk: .*scan-1: cannot be written .* check the"):
         rig.start(spec())
     (tmp_path / "scans").unlink()
     rig.start(spec("scan-2"))
