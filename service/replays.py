@@ -150,8 +150,8 @@ class Replays:
         return status
 
     def tell_again(self, event: RigEvent) -> None:
-        """Have it noted later that a replay is through: nothing else will ever say so."""
-        if event.kind == CAUGHT_UP:
+        """Have an end noted later, of a replay or a scan: nothing else will ever say so."""
+        if event.kind == CAUGHT_UP or event.kind in FINISHED:
             again = Timer(_AGAIN_S, self._tell, (event,))
             again.daemon = True
             again.start()
