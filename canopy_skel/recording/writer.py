@@ -27,7 +27,9 @@ class RecordingWriter:
     """Writes one scan to `<path>.part`, and gives it its name when it is finished.
 
     After each view the file is flushed and synced. If the block raises, the `.part` file stays: it
-    can be read and recovered. Not thread-safe. An existing file is never overwritten.
+    can be read and recovered. Each entry of the journal says again what the channels are, which
+    before the end of the file only their first chunk would know. Not thread-safe. An existing file
+    is never overwritten.
 
     Args:
         path: the recording to make.
@@ -124,6 +126,7 @@ class RecordingWriter:
     def write_journal(self, message: Message) -> None:
         """Write an entry of the journal that is encoded already."""
         with disk_errors(self._path):
+            say_channels_again(self._writer)
             self._add(message)
             self._writer.flush()
             self._sync()
@@ -164,6 +167,19 @@ def register(writer: Writer, name: str) -> int:
     topic = TOPICS[name]
     schema_id = writer.register_schema(topic.schema, topic.schema_encoding, topic.schema_data())
     return writer.register_channel(topic.name, topic.message_encoding, schema_id)
+
+
+def say_channels_again(writer: Writer) -> None:
+    """Put every schema and channel so far into the chunk in progress, as MCAP allows.
+
+    The package keeps them, and the chunk, to itself; beside it the checksum would miss them.
+    """
+    own = vars(writer)
+    chunk = own["_Writer__chunk_builder"]
+    for schema in own["_Writer__schemas"].values():
+        chunk.add_schema(schema)
+    for channel in own["_Writer__channels"].values():
+        chunk.add_channel(channel)
 
 
 def add_message(writer: Writer, channel_id: int, message: Message) -> None:
