@@ -3,14 +3,16 @@
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from canopy_skel.errors import RecordingError
 from canopy_skel.geometry import FloatArray
+from canopy_skel.messages import Message
 from canopy_skel.recording.writer import publish
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
@@ -55,8 +57,8 @@ class Feed(Protocol):
         """Nothing more of such a scan is wanted."""
         ...
 
-    def offer(self, scan_id: str, index: int) -> None:
-        """A view is safe on disk."""
+    def offer(self, scan_id: str, index: int, messages: Sequence[Message] = ()) -> None:
+        """A view is safe on disk; with its messages as recorded, where they are at hand."""
         ...
 
     def skeleton(self, scan_id: str) -> bytes | None:
@@ -322,7 +324,7 @@ class LocalRig:
             ),
             self._path(spec.scan_id),
             report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),
-            recorded=lambda index: parts.feed.offer(spec.scan_id, index),
+            recorded=partial(parts.feed.offer, spec.scan_id),
             conclude_with=self._conclude,
             views_before=views_before,
             exposed_before=exposed_before,

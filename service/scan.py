@@ -10,7 +10,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from types import MappingProxyType
 from canopy_skel.errors import CanopyError, RecordingError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
+from canopy_skel.messages import Message
 from canopy_skel.recording import RecordingWriter, carry_over, metadata_of, read_recording
 from canopy_skel.recording.writer import disk_errors
 from drivers.errors import DriverError
@@ -78,10 +79,12 @@ class ScanSession:
     """Drives one scan from where it is to its end, or until it is interrupted or stopped.
 
     `report(kind, fields)` is told of everything that happens, from the session's thread;
-    `recorded(index)` that a view is safe on disk; `conclude_with(state, detail)` is called before
-    the scan is said to have ended, and when nothing moves any more. views_before: recorded by
-    earlier sessions as far as is known; told until the recording has been read. exposed_before:
-    when the pictures of those were exposed, by view, as far as is known.
+    `recorded(index, messages)` that a view is safe on disk, with its messages if it was recorded
+    just now: to read them again costs the more the longer the scan is.
+    `conclude_with(state, detail)` is called before the scan is said to have ended, and when nothing
+    moves any more. views_before: recorded by earlier sessions as far as is known; told until the
+    recording has been read. exposed_before: when the pictures of those were exposed, by view, as
+    far as is known.
     """
 
     def __init__(
@@ -91,7 +94,7 @@ class ScanSession:
         path: Path,
         *,
         report: Report,
-        recorded: Callable[[int], None],
+        recorded: Callable[[int, Sequence[Message]], None],
         conclude_with: Callable[[ScanState, str], None] = lambda state, detail: None,
         views_before: int = 0,
         exposed_before: Mapping[int, int] = MappingProxyType({}),
@@ -233,7 +236,7 @@ class ScanSession:
     def _take_over(self, indices: Iterable[int]) -> None:
         self._count(*indices)
         for index in sorted(self._done):
-            self._recorded(index)
+            self._recorded(index, ())
 
     def _count(self, *indices: int) -> None:
         with self._lock:
@@ -249,10 +252,10 @@ class ScanSession:
             state = self._drive_to(waypoint)
             view = self._capture(index, state, writer)
             with stage("record"):
-                writer.write_view(view)
+                messages = writer.write_view(view)
             self._count(index)
             with stage("bus"):
-                self._recorded(index)
+                self._recorded(index, messages)
             with stage("journal"):
                 self._note(writer, "view", index=index)
 

@@ -184,6 +184,19 @@ def test_what_was_set_aside_is_caught_up_on_and_not_its_half_copy(rig, views):
     assert rig.caught_up == [("scan", 10, [])]
 
 
+def test_a_scan_under_way_is_sent_without_its_recording_being_read(rig, views):
+    path = rig.folder / "scan.mcap"
+    spec = ScanSpec(scan_id="scan", tree_id="t", waypoints=(), config=MethodConfig())
+    feed = BusFeed(rig.feeder)
+    rig.start_ready_worker()
+    with RecordingWriter(path, {"scan_id": "scan"}) as writer:
+        feed.begin(spec, rig.folder / "elsewhere.mcap")
+        for view in views[:4]:
+            feed.offer("scan", view.index, writer.write_view(view))
+        assert rig.feeder.flush(20)
+    assert feed.skeleton("scan") == rig.replayed(name="scan")
+
+
 class PausedError(Exception):
     pass
 

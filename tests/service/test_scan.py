@@ -15,7 +15,7 @@ from scenes.wood import view_from
 
 from canopy_skel.geometry import invert
 from canopy_skel.pipeline import MethodConfig
-from canopy_skel.recording import carry_over, read_recording
+from canopy_skel.recording import carry_over, messages_of_view, read_recording
 from drivers import kinematics
 from drivers.errors import CameraTimeoutError
 from drivers.guarded_arm import GuardedArm, Limits
@@ -85,6 +85,7 @@ class Collected:
 
     def __init__(self):
         self.offered = []
+        self.messages = {}
 
     def begin(self, spec, path):
         pass
@@ -92,8 +93,9 @@ class Collected:
     def catch_up(self, spec, path):
         pass
 
-    def offer(self, scan_id, index):
+    def offer(self, scan_id, index, messages):
         self.offered.append(index)
+        self.messages[scan_id, index] = messages
 
     def skeleton(self, scan_id):
         return None
@@ -192,6 +194,8 @@ def test_a_scan_visits_its_waypoints_and_records_what_it_saw(rig, fake):
         np.testing.assert_allclose(view.base_from_camera, pose, atol=2e-4)
         assert abs(view.stamp_ns - time.time_ns()) < 60e9
     assert rig.feed.offered == [0, 1, 2, 3]
+    for index in range(4):  # nobody has to read them again
+        assert rig.feed.messages["scan-1", index] == messages_of_view(recording, index)
     assert [kind for kind, _ in rig.events].count("view") == 4
     assert rig.events[-1][0] == "done"
     assert recording.metadata["tree_id"] == "t1"
