@@ -21,7 +21,7 @@ from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.messages import Message
 from canopy_skel.recording import RecordingWriter, carry_over, metadata_of, read_recording
-from canopy_skel.recording.writer import disk_errors
+from canopy_skel.recording.writer import disk_errors, sync_folder
 from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
 from drivers.protocols import (
@@ -218,6 +218,9 @@ class ScanSession:
                 indices = carry_over(source, writer)
                 with disk_errors(source):
                     source.unlink()
+                    # If it came back after a power cut, it would count for more than what has
+                    # been recorded since (`set_aside`).
+                    sync_folder(source.parent)
                 self._take_over(indices)
             self._note(writer, "running", views_done=len(self._done))
             try:

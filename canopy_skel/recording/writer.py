@@ -64,6 +64,7 @@ class RecordingWriter:
             self._writer = start_writer(self._stream, compression=self._compression)
             self._writer.add_metadata(METADATA_RECORD, self._metadata)
             self._sync()
+            sync_folder(self._part.parent)
             opened.pop_all()
         return self
 
@@ -220,12 +221,17 @@ def publish(part: Path, path: Path) -> None:
     """Give a finished file its name, durably."""
     with disk_errors(path):
         part.rename(path)
-        if hasattr(os, "O_DIRECTORY"):
-            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder, given, changed or taken, outlive a power cut."""
+    if hasattr(os, "O_DIRECTORY"):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import re
 import socket
 import threading
@@ -586,6 +587,28 @@ def test_what_a_killed_service_left_is_carried_on(rig):
     after = {v.index: v.depth_m.tobytes() for v in views_of(rig, "scan-1")}
     assert set(after) == {0, 1, 2, 3}
     assert all(after[index] == data for index, data in before.items())
+
+
+def test_what_was_set_aside_is_gone_for_good_before_more_is_recorded(rig, camera, monkeypatch):
+    """A power cut undoes what was not synced; the name of a file is synced with its folder."""
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    folder, synced_names, sync = rig.recording_path("scan-1").parent, [], os.fsync
+
+    def synced(descriptor):
+        sync(descriptor)
+        if os.path.samestat(os.fstat(descriptor), folder.stat()):
+            names = {path.suffix for path in folder.iterdir()}
+            synced_names.append((names, camera.grabs))
+
+    grabs = camera.grabs
+    monkeypatch.setattr(os, "fsync", synced)
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    # The new file's name first, or there might be neither.
+    assert synced_names[:2] == [({".aside", ".part"}, grabs), ({".part"}, grabs)]
 
 
 def test_the_count_of_views_never_falls_while_a_scan_is_taken_up_again(rig, monkeypatch):
