@@ -35,7 +35,7 @@ from drivers.protocols import (
 )
 from drivers.quality import QualityLimits, flaws, moved
 from drivers.waypoints import moves_to, travel_s
-from service.rig import ScanSpec, ScanState, ScanStatus
+from service.rig import FINISHED, ScanSpec, ScanState, ScanStatus
 
 log = logging.getLogger(__name__)
 
@@ -164,9 +164,10 @@ class ScanSession:
             self._tools.arm.stop()
 
     def conclude(self, state: ScanState) -> None:
-        """Set the state of a session that does not run: an operator's decision, or a take-over."""
+        """Set the state of a session that rests: an operator's decision. What is over stays so."""
         with self._lock:
-            if self._state is not ScanState.RUNNING or not self._thread.is_alive():
+            running = self._state is ScanState.RUNNING and self._thread.is_alive()
+            if not running and self._state not in FINISHED:
                 self._state = state
 
     def _run(self) -> None:

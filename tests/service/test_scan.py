@@ -306,6 +306,13 @@ def test_a_cancelled_scan_keeps_its_views_and_does_not_go_on(rig):
         rig.resume("scan-1")
 
 
+def test_a_scan_that_is_done_is_not_cancelled_any_more(rig):
+    rig.start(spec())
+    wait_for(rig, "scan-1", ScanState.DONE)
+    assert rig.cancel("scan-1").state is ScanState.DONE
+    assert rig.status("scan-1").state is ScanState.DONE
+
+
 @pytest.mark.parametrize("step", ["rename", "unlink", "exists"])
 def test_a_disk_that_went_read_only_stops_the_scan_and_costs_nothing(rig, monkeypatch, step):
     rig.start(spec())
