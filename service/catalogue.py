@@ -381,7 +381,7 @@ def _set_up(connection: sqlite3.Connection, record: object) -> None:
     cursor = connection.cursor()
     for pragma in (
         "journal_mode=WAL",
-        "synchronous=NORMAL",
+        "synchronous=FULL",  # with NORMAL a power cut loses what was noted last
         "foreign_keys=ON",
         f"busy_timeout={_BUSY_TIMEOUT_MS}",
     ):

@@ -14,6 +14,7 @@ from fastapi import FastAPI
 
 from canopy_skel.document import to_json
 from canopy_skel.geometry import FloatArray, invert
+from canopy_skel.messages import Message
 from canopy_skel.recording.reader import GROUND_TRUTH
 from drivers.guarded_arm import GuardedArm, KeepOut, Limits
 from drivers.oak.camera import OakCamera
@@ -111,9 +112,9 @@ class BusFeed:
         """Have no more views of such a recording sent."""
         self._feeder.leave(scan_id)
 
-    def offer(self, scan_id: str, index: int) -> None:
+    def offer(self, scan_id: str, index: int, messages: Sequence[Message] = ()) -> None:
         """Have a recorded view sent."""
-        self._feeder.offer(index)
+        self._feeder.offer(index, messages)
 
     def skeleton(self, scan_id: str) -> bytes | None:
         """Return the newest document."""

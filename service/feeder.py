@@ -12,6 +12,7 @@ import zenoh
 
 from canopy_skel.errors import RecordingError, UsageError
 from canopy_skel.messages import Message
+from canopy_skel.recording.grouping import Group
 from service.bus import Keys
 from service.envelope import ViewEnvelope, encode_envelope
 from service.heartbeat import Version
@@ -158,7 +159,10 @@ class ViewFeeder:
         return self._watch.workers()
 
     def worker_status(self) -> PartStatus:
-        """Return whether a worker is there and gets on."""
+        """Return whether a worker is there and gets on, and is sent anything at all."""
+        if not self._thread.is_alive():
+            detail = "no view is sent to it any more; restart the service, nothing is lost"
+            return PartStatus(name="worker", ready=False, detail=detail)
         return self._watch.status()
 
     def latest_skeleton(self, scan_id: str) -> bytes | None:
@@ -210,17 +214,26 @@ class ViewFeeder:
         return None
 
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                if self._stopping:
-                    return
-                workers = self._watch.workers()
-                step = self._next(workers)
-                if step is None:
-                    self._changed.wait(_TICK_S)
-            self._fetch_missed(workers)
-            if step is not None:
-                step()
+        """Step after step; one that fails costs its own work, not that of every later scan."""
+        while not self._stopping:
+            try:
+                self._step()
+            except Exception:
+                if not self._stopping:
+                    _log.exception("a step of the feeder failed; it goes on")
+                    time.sleep(_TICK_S)
+
+    def _step(self) -> None:
+        with self._changed:
+            if self._stopping:
+                return
+            workers = self._watch.workers()
+            step = self._next(workers)
+            if step is None:
+                self._changed.wait(_TICK_S)
+        self._fetch_missed(workers)
+        if step is not None:
+            step()
 
     def _fetch_missed(self, workers: Sequence[WorkerSeen]) -> None:
         """Ask for a skeleton that was missed, at most once in a while."""
@@ -268,12 +281,17 @@ class ViewFeeder:
         threading.Thread(target=self._list, args=(scan,), name="view lister", daemon=True).start()
 
     def _list(self, scan: OfferedScan) -> None:
-        """Look up which views a recording has; one that cannot be read has none."""
+        """Look up which views a recording has; one that cannot be read has none.
+
+        Whatever happens it ends as looked through: the scans behind it wait for that.
+        """
+        groups: tuple[Group, ...] = ()
         try:
             groups = scan.recorded.look_through(scan.source.recording()).groups
-        except RecordingError as error:
-            _log.warning("scan %s: no view of it is sent: %s", scan.source.scan_id, error)
-            groups = ()
+        except Exception as error:
+            foreseen = isinstance(error, RecordingError)
+            name = scan.source.scan_id
+            _log.warning("scan %s: no view of it is sent: %s", name, error, exc_info=not foreseen)
         with self._changed:
             scan.views = {one.index: OfferedView() for one in groups if not one.partial}
             scan.listing = Listing.DONE
@@ -310,8 +328,12 @@ class ViewFeeder:
                 encode_envelope(envelope),
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
-        except (RecordingError, UsageError, zenoh.ZError) as error:
-            _log.warning("scan %s: view %d is not sent yet: %s", source.scan_id, index, error)
+        except Exception as error:  # put off, or it would be tried for ever before all others
+            foreseen = isinstance(error, (RecordingError, UsageError, zenoh.ZError))
+            name = source.scan_id
+            _log.warning(
+                "scan %s: view %d is not sent yet: %s", name, index, error, exc_info=not foreseen
+            )
             scan.recorded.forget()
             one.put_off()
         else:

@@ -3,14 +3,16 @@
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from canopy_skel.errors import RecordingError
 from canopy_skel.geometry import FloatArray
+from canopy_skel.messages import Message
 from canopy_skel.recording.writer import publish
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
@@ -55,8 +57,8 @@ class Feed(Protocol):
         """Nothing more of such a scan is wanted."""
         ...
 
-    def offer(self, scan_id: str, index: int) -> None:
-        """A view is safe on disk."""
+    def offer(self, scan_id: str, index: int, messages: Sequence[Message] = ()) -> None:
+        """A view is safe on disk; with its messages as recorded, where they are at hand."""
         ...
 
     def skeleton(self, scan_id: str) -> bytes | None:
@@ -287,7 +289,10 @@ class LocalRig:
         """
         before = self._sessions.get(spec.scan_id)
         session = self._session_for(spec, views_before, before[1].exposed_ns if before else {})
-        session.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            session.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RigNotReadyError(f"disk: {_unwritable(session.path.parent, error)}") from error
         self._sessions[spec.scan_id] = (spec, session)
         try:
             if self._stops != stops:
@@ -319,7 +324,7 @@ class LocalRig:
             ),
             self._path(spec.scan_id),
             report=lambda kind, fields: self._tell(spec.scan_id, kind, fields),
-            recorded=lambda index: parts.feed.offer(spec.scan_id, index),
+            recorded=partial(parts.feed.offer, spec.scan_id),
             conclude_with=self._conclude,
             views_before=views_before,
             exposed_before=exposed_before,
@@ -374,8 +379,12 @@ class LocalRig:
         return PartStatus(name="camera", ready=not detail, detail=detail)
 
     def _disk_status(self) -> PartStatus:
-        self._parts.data.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(self._parts.data).free
+        try:
+            self._parts.data.mkdir(parents=True, exist_ok=True)
+            free = shutil.disk_usage(self._parts.data).free
+        except OSError as error:
+            detail = _unwritable(self._parts.data, error)
+            return PartStatus(name="disk", ready=False, detail=detail)
         detail = "" if free >= ENOUGH_DISK_BYTES else f"only {free >> 20} MiB free; make room"
         return PartStatus(name="disk", ready=not detail, detail=detail)
 
@@ -387,6 +396,10 @@ class LocalRig:
 
 def _not_ready(error: DriverError) -> RigNotReadyError:
     return RigNotReadyError(f"arm: {type(error).__name__}: {error}")
+
+
+def _unwritable(path: Path, error: OSError) -> str:
+    return f"{path}: cannot be written ({error.strerror}); check the disk"
 
 
 def _trouble(device: Opened) -> str:

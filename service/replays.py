@@ -1,6 +1,7 @@
 """Replays over HTTP: a recording that is there becomes a skeleton, and no arm moves."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,8 @@ def replayable(path: Path) -> Recording:
     """Return a recording whose views can go over the bus as they are.
 
     Raises:
-        RecordingError: it cannot be read, has no whole view, or holds other messages than canopy's.
+        RecordingError: it cannot be read, has no whole view or two of one index, or holds other
+            messages than canopy's.
     """
     recording = read_recording(path)
     mend = "replay it where it lies, with `canopy replay`, which knows other messages too"
@@ -45,6 +47,13 @@ def replayable(path: Path) -> Recording:
         schema = recording.file.schema_of(channel.id).name
         if topic is not None and schema != topic.schema:
             raise RecordingError(f"{channel.topic} holds {schema}, not {topic.schema}; {mend}")
+    indices = Counter(group.index for group in recording.groups)
+    if len(indices) < len(recording.groups):  # the bus knows a view by its index
+        twice = [index for index, views in indices.items() if views > 1]
+        raise RecordingError(
+            f"it has several views of index {', '.join(map(str, twice))}; number them anew by"
+            " `sequence`, or replay it where it lies, with `canopy replay`, which uses the first"
+        )
     if not whole_views(recording):
         raise RecordingError("it has no whole view; `canopy inspect` says what it has")
     return recording
@@ -150,8 +159,8 @@ class Replays:
         return status
 
     def tell_again(self, event: RigEvent) -> None:
-        """Have it noted later that a replay is through: nothing else will ever say so."""
-        if event.kind == CAUGHT_UP:
+        """Have an end noted later, of a replay or a scan: nothing else will ever say so."""
+        if event.kind == CAUGHT_UP or event.kind in FINISHED:
             again = Timer(_AGAIN_S, self._tell, (event,))
             again.daemon = True
             again.start()

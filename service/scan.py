@@ -10,7 +10,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,9 @@ from types import MappingProxyType
 from canopy_skel.errors import CanopyError, RecordingError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
+from canopy_skel.messages import Message
 from canopy_skel.recording import RecordingWriter, carry_over, metadata_of, read_recording
+from canopy_skel.recording.writer import disk_errors, sync_folder
 from drivers.errors import DriverError
 from drivers.guarded_arm import Limits
 from drivers.protocols import (
@@ -33,7 +35,7 @@ from drivers.protocols import (
 )
 from drivers.quality import QualityLimits, flaws, moved
 from drivers.waypoints import moves_to, travel_s
-from service.rig import ScanSpec, ScanState, ScanStatus
+from service.rig import FINISHED, ScanSpec, ScanState, ScanStatus
 
 log = logging.getLogger(__name__)
 
@@ -77,10 +79,12 @@ class ScanSession:
     """Drives one scan from where it is to its end, or until it is interrupted or stopped.
 
     `report(kind, fields)` is told of everything that happens, from the session's thread;
-    `recorded(index)` that a view is safe on disk; `conclude_with(state, detail)` is called before
-    the scan is said to have ended, and when nothing moves any more. views_before: recorded by
-    earlier sessions as far as is known; told until the recording has been read. exposed_before:
-    when the pictures of those were exposed, by view, as far as is known.
+    `recorded(index, messages)` that a view is safe on disk, with its messages if it was recorded
+    just now: to read them again costs the more the longer the scan is.
+    `conclude_with(state, detail)` is called before the scan is said to have ended, and when nothing
+    moves any more. views_before: recorded by earlier sessions as far as is known; told until the
+    recording has been read. exposed_before: when the pictures of those were exposed, by view, as
+    far as is known.
     """
 
     def __init__(
@@ -90,7 +94,7 @@ class ScanSession:
         path: Path,
         *,
         report: Report,
-        recorded: Callable[[int], None],
+        recorded: Callable[[int, Sequence[Message]], None],
         conclude_with: Callable[[ScanState, str], None] = lambda state, detail: None,
         views_before: int = 0,
         exposed_before: Mapping[int, int] = MappingProxyType({}),
@@ -160,9 +164,10 @@ class ScanSession:
             self._tools.arm.stop()
 
     def conclude(self, state: ScanState) -> None:
-        """Set the state of a session that does not run: an operator's decision, or a take-over."""
+        """Set the state of a session that rests: an operator's decision. What is over stays so."""
         with self._lock:
-            if self._state is not ScanState.RUNNING or not self._thread.is_alive():
+            running = self._state is ScanState.RUNNING and self._thread.is_alive()
+            if not running and self._state not in FINISHED:
                 self._state = state
 
     def _run(self) -> None:
@@ -170,7 +175,8 @@ class ScanSession:
             self._scan()
         except ScanInterruptedError:
             self._end(self._wanted or ScanState.PAUSED, "")
-        except (DriverError, CanopyError, PictureRefusedError) as error:
+        # A disk can refuse anything at any time; mended, it lets the scan go on.
+        except (DriverError, CanopyError, PictureRefusedError, OSError) as error:
             if self._wanted is None:
                 self._end(ScanState.STOPPED, self._drop_motion(error))
             else:  # the interruption makes the driver complain of the move it cut short
@@ -211,7 +217,11 @@ class ScanSession:
         ) as writer:
             if source is not None:
                 indices = carry_over(source, writer)
-                source.unlink()
+                with disk_errors(source):
+                    source.unlink()
+                    # If it came back after a power cut, it would count for more than what has
+                    # been recorded since (`set_aside`).
+                    sync_folder(source.parent)
                 self._take_over(indices)
             self._note(writer, "running", views_done=len(self._done))
             try:
@@ -230,7 +240,7 @@ class ScanSession:
     def _take_over(self, indices: Iterable[int]) -> None:
         self._count(*indices)
         for index in sorted(self._done):
-            self._recorded(index)
+            self._recorded(index, ())
 
     def _count(self, *indices: int) -> None:
         with self._lock:
@@ -246,10 +256,10 @@ class ScanSession:
             state = self._drive_to(waypoint)
             view = self._capture(index, state, writer)
             with stage("record"):
-                writer.write_view(view)
+                messages = writer.write_view(view)
             self._count(index)
             with stage("bus"):
-                self._recorded(index)
+                self._recorded(index, messages)
             with stage("journal"):
                 self._note(writer, "view", index=index)
 
@@ -337,10 +347,14 @@ def set_aside(path: Path) -> Path | None:
     """Put what an earlier session left of a recording aside, to be carried over; None if nothing.
 
     A file that is aside already was not carried over to the end; it holds all that its copy does.
+
+    Raises:
+        RecordingError: the disk does not let it; what there is stays.
     """
     part, aside = path.with_name(path.name + ".part"), path.with_name(path.name + ".aside")
-    if aside.exists():
-        part.unlink(missing_ok=True)
-    elif part.exists():
-        part.rename(aside)
-    return aside if aside.exists() else None
+    with disk_errors(path):
+        if aside.exists():
+            part.unlink(missing_ok=True)
+        elif part.exists():
+            part.rename(aside)
+        return aside if aside.exists() else None

@@ -153,8 +153,8 @@ class Scans:
 
     def active(self) -> ScanStatus | None:
         """Return the newest scan that can still go on, None if there is none."""
-        unfinished = self.catalogue.unfinished()
-        return self.status(unfinished[0].scan_id) if unfinished else None
+        statuses = map(self.status_of, self.catalogue.unfinished())
+        return next((one for one in statuses if one.state not in FINISHED), None)
 
     def stop(self) -> None:
         """Stop the arm, then note it: a service that is started again holds the arm.
@@ -248,14 +248,16 @@ class Scans:
 
     def _require_unfinished(self, scan_id: str) -> ScanRecord:
         record = self.record(scan_id)
-        if record.state in FINISHED:
-            raise ScanOverError(f"scan {scan_id} is {record.state.value}; start a new one")
+        state = self.status_of(record).state
+        if state in FINISHED:
+            raise ScanOverError(f"scan {scan_id} is {state.value}; start a new one")
         return record
 
-    def _refresh(self, scan_id: str) -> ScanStatus:
+    def _refresh(self, scan_id: str, *, at_its_end: bool = False) -> ScanStatus:
         """Note where a scan is; the lock keeps an older answer from overwriting a newer one.
 
-        That it cannot be noted does not undo what the arm has done, so it is no error.
+        That it cannot be noted does not undo what the arm has done, so it is no error; but of its
+        end nothing else will tell.
         """
         with self._refreshing:
             try:
@@ -265,6 +267,8 @@ class Scans:
             try:
                 self.catalogue.update(status, self._recording_path(scan_id))
             except OperationalError:
+                if at_its_end:
+                    raise
                 logger.exception("status not noted scan_id=%s", scan_id)
         return status
 
@@ -317,8 +321,10 @@ class Scans:
         skeleton = self._rig.skeleton(event.scan_id)
         if skeleton is not None:
             self.catalogue.add_revision(event.scan_id, skeleton)
-        is_replay = record.kind is ScanKind.REPLAY
-        status = self.replays.after(event) if is_replay else self._refresh(event.scan_id)
+        if record.kind is ScanKind.REPLAY:
+            status = self.replays.after(event)
+        else:
+            status = self._refresh(event.scan_id, at_its_end=event.kind in FINISHED)
         self._add_event(status, event.kind, event.fields)
 
     def _add_event(self, status: ScanStatus, kind: str, fields: Mapping[str, object]) -> None:

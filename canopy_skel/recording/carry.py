@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+from canopy_skel.errors import RecordingError
 from canopy_skel.messages import COLOR_IMAGE, EVENT, LEFT_IMAGE, TRANSFORMS, Message
 from canopy_skel.recording.mcap_file import McapFile, MessageReader, MessageRef, scan_mcap
 from canopy_skel.recording.reader import read_recording
@@ -16,6 +17,12 @@ def carry_over(source: Path, writer: RecordingWriter) -> tuple[int, ...]:
         RecordingError: the source cannot be read, or the target not be written.
     """
     file = scan_mcap(source)
+    unknown = sum(ref.channel_id not in file.channels for ref in file.messages)
+    if unknown:  # to go on without them would be to lose them
+        raise RecordingError(
+            f"{source}: is damaged where it says what {unknown} of its messages are; copy it if it"
+            " is worth a try to save them, cancel the scan, and scan the tree anew"
+        )
     for message in _journal(file):
         writer.write_journal(message)
     if not _has_pictures(file):

@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -30,7 +31,21 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNKS_IN_MEMORY = 4
 MOST_CHUNK_BYTES = 1 << 28
-"""Of a chunk that is read; recorders make them of a few MiB, or of one large picture."""
+"""Of a chunk that is read, packed or not, and of any other record that is read as one; recorders
+make chunks of a few MiB, or of one large picture."""
+_PIECE_BYTES = 1 << 20
+# The other kinds are indices, which a pass does without, and what is yet to be invented.
+_READ = frozenset(
+    {
+        Opcode.HEADER,
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.MESSAGE,
+        Opcode.CHUNK,
+        Opcode.METADATA,
+        Opcode.DATA_END,
+    }
+)
 # What the parsers of the mcap package and the decompressors (lz4: RuntimeError) raise on damage.
 _DAMAGE = (
     McapError,
@@ -95,7 +110,7 @@ class McapFile:
 
     def attachment(self, ref: AttachmentRef) -> bytes:
         """Read the data of an attachment."""
-        with open_recording(self.path) as stream:
+        with _disk_errors(self.path), open_recording(self.path) as stream:
             return bytes(Attachment.read(_fields(_record_at(stream, ref.record_offset))).data)
 
 
@@ -105,7 +120,7 @@ def scan_mcap(path: Path) -> McapFile:
     Raises:
         RecordingError: no such file, not readable, or not MCAP.
     """
-    with open_recording(path) as stream:
+    with _disk_errors(path), open_recording(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         magic = stream.read(len(MCAP0_MAGIC))
         if not magic or not MCAP0_MAGIC.startswith(magic):
@@ -127,9 +142,22 @@ def open_recording(path: Path) -> BinaryIO:
     except IsADirectoryError as error:
         raise RecordingError(f"{path}: is a folder; name the MCAP file in it") from error
     except OSError as error:
-        raise RecordingError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
-        ) from error
+        raise _unreadable(path, error) from error
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """A file on a bad disk opens well, and fails where it is read."""
+    try:
+        yield
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> RecordingError:
+    return RecordingError(
+        f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
+    )
 
 
 class _Walk:
@@ -151,20 +179,34 @@ class _Walk:
             if opcode == 0 or length > self._file.size - offset - 9:
                 self._file.cut_at = offset
                 return
-            body = stream.read(length)
             if opcode == Opcode.FOOTER:
+                stream.seek(length, os.SEEK_CUR)
                 if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                     self._file.cut_at = offset + 9 + length
                 return
+            crc_before, self._data_crc = self._data_crc, zlib.crc32(head, self._data_crc)
+            pieces = self._pieces(stream, length)
             try:
-                self._record(opcode, body, offset)
+                if opcode == Opcode.ATTACHMENT:
+                    self._attachment(pieces, length, offset)
+                elif opcode in _READ:
+                    _require_readable(length)
+                    self._record(opcode, b"".join(pieces), offset, crc_before)
             except _DAMAGE as error:
                 kind = _name(opcode)
                 self._file.damage.append(f"the {kind} at byte {offset} is damaged ({error})")
-            self._data_crc = zlib.crc32(body, zlib.crc32(head, self._data_crc))
+            for _ in pieces:
+                pass  # what is not read counts into the checksum too
             offset += 9 + length
 
-    def _record(self, opcode: int, body: bytes, offset: int) -> None:
+    def _pieces(self, stream: BinaryIO, length: int) -> Iterator[bytes]:
+        """Read the body of a record, which may be larger than memory, and count it as data."""
+        while length and (piece := stream.read(min(length, _PIECE_BYTES))):
+            self._data_crc = zlib.crc32(piece, self._data_crc)
+            length -= len(piece)
+            yield piece
+
+    def _record(self, opcode: int, body: bytes, offset: int, crc_before: int) -> None:
         file = self._file
         if opcode == Opcode.HEADER:
             header = Header.read(_fields(body))
@@ -173,11 +215,9 @@ class _Walk:
             self._chunk(Chunk.read(_fields(body)), offset)
         elif opcode == Opcode.METADATA:
             file.metadata.append(Metadata.read(_fields(body)))
-        elif opcode == Opcode.ATTACHMENT:
-            self._attachment(body, offset)
         elif opcode == Opcode.DATA_END:
             expected = DataEnd.read(_fields(body)).data_section_crc
-            if expected not in (0, self._data_crc) and not file.damage:
+            if expected not in (0, crc_before) and not file.damage:
                 file.damage.append("the checksum of the file's data does not match")
         else:
             self._small_record(opcode, body, None, offset + 9)
@@ -212,22 +252,33 @@ class _Walk:
                 )
             )
 
-    def _attachment(self, body: bytes, offset: int) -> None:
-        (expected,) = struct.unpack("<I", body[-4:])
-        actual = zlib.crc32(body[:-4])
-        attachment = Attachment.read(_fields(body))
-        if expected not in (0, actual):
-            raise ValueError(f"checksum of {attachment.name!r} does not match")
-        self._file.attachments.append(
-            AttachmentRef(
-                name=attachment.name,
-                media_type=attachment.media_type,
-                size=len(attachment.data),
-                create_time_ns=attachment.create_time,
-                log_time_ns=attachment.log_time,
-                record_offset=offset,
-            )
+    def _attachment(self, pieces: Iterator[bytes], length: int, offset: int) -> None:
+        """Note an attachment whose data stays where it is; its name and type are in one piece."""
+        head = next(pieces, b"")
+        actual, last = 0, head
+        for piece in pieces:
+            actual, last = zlib.crc32(last[:-4], actual), last[-4:] + piece
+        actual = zlib.crc32(last[:-4], actual)
+        (expected,) = struct.unpack("<I", last[-4:])
+        fields = _fields(head)
+        ref = AttachmentRef(
+            log_time_ns=fields.read8(),
+            create_time_ns=fields.read8(),
+            name=fields.read_prefixed_string(),
+            media_type=fields.read_prefixed_string(),
+            size=fields.read8(),
+            record_offset=offset,
         )
+        if fields.count + ref.size + 4 > length:
+            raise ValueError(f"{ref.name!r} is cut off")
+        if expected not in (0, actual):
+            raise ValueError(f"checksum of {ref.name!r} does not match")
+        self._file.attachments.append(ref)
+
+
+def _require_readable(length: int) -> None:
+    if length > MOST_CHUNK_BYTES:
+        raise ValueError(f"it has {length} bytes, more than {MOST_CHUNK_BYTES}")
 
 
 class MessageReader:
@@ -241,10 +292,12 @@ class MessageReader:
         """Return the data of a message.
 
         Raises:
-            RecordingError: the file has changed or vanished since it was scanned.
+            RecordingError: the file has changed or vanished since it was scanned, or the disk
+                does not give it.
         """
         try:
-            return self._read(ref)
+            with _disk_errors(self._path):
+                return self._read(ref)
         except _DAMAGE as error:
             raise RecordingError(f"{self._path}: changed while it was read ({error})") from error
 

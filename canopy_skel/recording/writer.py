@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Literal, Self
@@ -27,7 +27,9 @@ class RecordingWriter:
     """Writes one scan to `<path>.part`, and gives it its name when it is finished.
 
     After each view the file is flushed and synced. If the block raises, the `.part` file stays: it
-    can be read and recovered. Not thread-safe. An existing file is never overwritten.
+    can be read and recovered. Each entry of the journal says again what the channels are, which
+    before the end of the file only their first chunk would know. Not thread-safe. An existing file
+    is never overwritten.
 
     Args:
         path: the recording to make.
@@ -57,10 +59,13 @@ class RecordingWriter:
 
     def __enter__(self) -> Self:
         """Open the file and write the metadata."""
-        self._stream = open_new(self._path, self._part)
-        self._writer = start_writer(self._stream, compression=self._compression)
-        self._writer.add_metadata(METADATA_RECORD, self._metadata)
-        self._sync()
+        with disk_errors(self._path), ExitStack() as opened:
+            self._stream = opened.enter_context(open_new(self._path, self._part))
+            self._writer = start_writer(self._stream, compression=self._compression)
+            self._writer.add_metadata(METADATA_RECORD, self._metadata)
+            self._sync()
+            sync_folder(self._part.parent)
+            opened.pop_all()
         return self
 
     def __exit__(
@@ -70,7 +75,7 @@ class RecordingWriter:
         trace: TracebackType | None,
     ) -> None:
         """Finish and rename; after an error only close what is there."""
-        with _disk_errors(self._path), self._stream:
+        with disk_errors(self._path), self._stream:
             if kind is None:
                 self._writer.finish()
             else:
@@ -107,7 +112,7 @@ class RecordingWriter:
         if unknown:
             raise UsageError(f"{min(unknown)} is not one of {', '.join(TOPICS)}")
         self._indices |= indices
-        with _disk_errors(self._path):
+        with disk_errors(self._path):
             for message in messages:
                 self._add(message)
             self._writer.flush()
@@ -121,14 +126,15 @@ class RecordingWriter:
 
     def write_journal(self, message: Message) -> None:
         """Write an entry of the journal that is encoded already."""
-        with _disk_errors(self._path):
+        with disk_errors(self._path):
+            say_channels_again(self._writer)
             self._add(message)
             self._writer.flush()
             self._sync()
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Attach a file."""
-        with _disk_errors(self._path):
+        with disk_errors(self._path):
             self._writer.flush()
             self._writer.add_attachment(0, 0, name, media_type, data)
             self._sync()
@@ -162,6 +168,19 @@ def register(writer: Writer, name: str) -> int:
     topic = TOPICS[name]
     schema_id = writer.register_schema(topic.schema, topic.schema_encoding, topic.schema_data())
     return writer.register_channel(topic.name, topic.message_encoding, schema_id)
+
+
+def say_channels_again(writer: Writer) -> None:
+    """Put every schema and channel so far into the chunk in progress, as MCAP allows.
+
+    The package keeps them, and the chunk, to itself; beside it the checksum would miss them.
+    """
+    own = vars(writer)
+    chunk = own["_Writer__chunk_builder"]
+    for schema in own["_Writer__schemas"].values():
+        chunk.add_schema(schema)
+    for channel in own["_Writer__channels"].values():
+        chunk.add_channel(channel)
 
 
 def add_message(writer: Writer, channel_id: int, message: Message) -> None:
@@ -200,18 +219,24 @@ def open_new(path: Path, part: Path, *, over_leftover: bool = False) -> BinaryIO
 
 def publish(part: Path, path: Path) -> None:
     """Give a finished file its name, durably."""
-    with _disk_errors(path):
+    with disk_errors(path):
         part.rename(path)
-        if hasattr(os, "O_DIRECTORY"):
-            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder, given, changed or taken, outlive a power cut."""
+    if hasattr(os, "O_DIRECTORY"):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 @contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
+def disk_errors(path: Path) -> Iterator[None]:
+    """Make a RecordingError, which names the file and the mend, of what a disk refuses."""
     try:
         yield
     except OSError as error:

@@ -89,8 +89,9 @@ def _replay_stored(here: Context, body: ReplayBody, key: str | None) -> JSONResp
     if body.scan_id is None:
         raise _invalid("body.scan_id", f"name an ended scan, or send one as {RECORDING_TYPE}")
     record = here.scans.record(body.scan_id)
-    if record.state not in FINISHED:
-        detail = f"scan {body.scan_id} is {record.state.value}: wait for its end, or cancel it"
+    state = here.scans.status_of(record).state
+    if state not in FINISHED:
+        detail = f"scan {body.scan_id} is {state.value}: wait for its end, or cancel it"
         raise Problem(409, "scan_under_way", "The scan has not ended", detail)
     file = recorded_file(here.scans.recording(body.scan_id))
     if file is None:

@@ -22,8 +22,10 @@ from service.rig import FINISHED, status_fields
 
 router = APIRouter(prefix="/v1/scans", tags=["scans"])
 _LOOK_AGAIN_S = 5.0
-# A rig says that a scan has ended before it tells the events that led there.
+# A rig says that a scan has ended before it tells the events that led there, and while the end
+# cannot be noted, nor can they.
 _LAST_WORDS_S = 0.3
+_LAST_WORDS_UNNOTED_S = 5.0
 
 
 Key = Annotated[str | None, Header(alias="idempotency-key", min_length=1, max_length=255)]
@@ -111,19 +113,22 @@ async def follow_scan(
     seq, silent = last_event_id, False
     while not here.bell.closed:
         ring = here.bell.next_ring()
-        over, events = await run_in_threadpool(_news, here, scan_id, seq)
+        last_words_s, events = await run_in_threadpool(_news, here, scan_id, seq)
         for event in events:
             seq = event.seq
             yield ServerSentEvent(id=str(seq), event=event.kind, data=event.data)
-        if over and silent and not events:
+        if last_words_s and silent and not events:
             yield ServerSentEvent(event="end", data={})
             return
-        silent = not await wait_for_ring(ring, _LAST_WORDS_S if over else _LOOK_AGAIN_S)
+        silent = not await wait_for_ring(ring, last_words_s or _LOOK_AGAIN_S)
 
 
-def _news(here: Context, scan_id: str, seq: int) -> tuple[bool, list[EventRecord]]:
-    over = here.scans.record(scan_id).state in FINISHED
-    return over, here.scans.catalogue.events(scan_id, seq)
+def _news(here: Context, scan_id: str, seq: int) -> tuple[float | None, list[EventRecord]]:
+    """Return how long to wait for more of a scan that is over (None: it is not), and events."""
+    record = here.scans.record(scan_id)
+    over = here.scans.status_of(record).state in FINISHED
+    last_words_s = _LAST_WORDS_S if record.state in FINISHED else _LAST_WORDS_UNNOTED_S
+    return last_words_s if over else None, here.scans.catalogue.events(scan_id, seq)
 
 
 @router.get("/{scan_id}/views/{index}/color.jpg", response_class=Response)

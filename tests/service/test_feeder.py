@@ -1,5 +1,6 @@
 """Scans that the workers do not get while they are under way; what they do get: test_worker."""
 
+import errno
 from collections import Counter
 from contextlib import suppress
 from itertools import pairwise
@@ -183,6 +184,19 @@ def test_what_was_set_aside_is_caught_up_on_and_not_its_half_copy(rig, views):
     assert rig.caught_up == [("scan", 10, [])]
 
 
+def test_a_scan_under_way_is_sent_without_its_recording_being_read(rig, views):
+    path = rig.folder / "scan.mcap"
+    spec = ScanSpec(scan_id="scan", tree_id="t", waypoints=(), config=MethodConfig())
+    feed = BusFeed(rig.feeder)
+    rig.start_ready_worker()
+    with RecordingWriter(path, {"scan_id": "scan"}) as writer:
+        feed.begin(spec, rig.folder / "elsewhere.mcap")
+        for view in views[:4]:
+            feed.offer("scan", view.index, writer.write_view(view))
+        assert rig.feeder.flush(20)
+    assert feed.skeleton("scan") == rig.replayed(name="scan")
+
+
 class PausedError(Exception):
     pass
 
@@ -258,3 +272,68 @@ def test_what_no_worker_takes_holds_nothing_up_and_is_said(rig, views, monkeypat
         [(strange, 1, [0]), (good, 10, []), (unusable, 1, []), ("never-recorded", 0, [])]
     )
     wait_for_skeleton(rig, good)
+
+
+@pytest.fixture
+def bad_disk(tmp_path):
+    """A recording that opens and cannot be read: EIO, as from a bad sector."""
+    path = tmp_path / "bad.mcap"
+    path.symlink_to("/proc/self/mem")
+    return path
+
+
+def not_even_found():
+    raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_recording_that_the_disk_does_not_give_keeps_no_other_from_being_sent(
+    rig, views, bad_disk
+):
+    good = record(rig, views[:3])
+    for name, recording in (("on-a-bad-sector", lambda: bad_disk), ("lost", not_even_found)):
+        rig.feeder.catch_up(rig.source(name, recording=recording))
+    rig.feeder.begin(rig.source("under-way"))
+    rig.start_ready_worker()
+    wait_for(lambda: len(rig.caught_up) == 3)
+    assert sorted(rig.caught_up) == [("lost", 0, []), ("on-a-bad-sector", 0, []), (good, 3, [])]
+    wait_for_skeleton(rig, good)
+
+
+def test_a_disk_that_fails_during_a_scan_ends_the_sending_of_no_later_one(rig, views, bad_disk):
+    rig.start_ready_worker()
+    for name, recording in (("on-a-bad-sector", lambda: bad_disk), ("lost", not_even_found)):
+        rig.feeder.begin(rig.source(name, recording=recording))
+        rig.feeder.offer(0)
+        assert not rig.feeder.flush(0.5)
+    scan = record(rig, views[:3])
+    assert rig.feeder.flush(20)
+    assert rig.feeder.latest_skeleton(scan) == rig.replayed()
+
+
+def test_who_fails_to_hear_of_a_scan_does_not_end_the_sending(rig, views):
+    class Deaf(list):
+        def append(self, told):
+            super().append(told)
+            raise RuntimeError("no room to note it")
+
+    rig.caught_up = Deaf()
+    first, second = record(rig, views[:2]), record(rig, views[:3])
+    rig.feeder.begin(rig.source("under-way"))
+    rig.start_ready_worker()
+    wait_for(lambda: len(rig.caught_up) == 2)
+    assert rig.caught_up == [(first, 2, []), (second, 3, [])]
+    assert rig.feeder.worker_status().ready
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_feeder_that_has_ended_is_seen(rig, views):
+    class Fatal(list):
+        def append(self, told):
+            raise SystemExit
+
+    rig.caught_up = Fatal()
+    record(rig, views[:1])
+    rig.feeder.begin(rig.source("under-way"))
+    rig.start_ready_worker()
+    wait_for(lambda: "no view is sent to it any more" in rig.feeder.worker_status().detail)
+    assert not rig.feeder.worker_status().ready

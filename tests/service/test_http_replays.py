@@ -233,8 +233,11 @@ def test_there_must_be_room_for_it_the_first_time(live, monkeypatch):
     assert len(live.rig.adopted) == 1
 
 
-def renamed(names, profile=""):
-    """Return the demo under other names of topics, as another's program may write it."""
+def renamed(names, profile="", number=lambda index: index):
+    """Return the demo under other names of topics, as another's program may write it.
+
+    number: gives each view another index.
+    """
     out = BytesIO()
     writer = Writer(out)
     writer.start(profile=profile)
@@ -251,7 +254,7 @@ def renamed(names, profile=""):
             message.log_time,
             message.data,
             message.publish_time,
-            message.sequence,
+            number(message.sequence),
         )
     writer.finish()
     return out.getvalue()
@@ -265,6 +268,7 @@ def renamed(names, profile=""):
         (renamed({COLOR: "/rgb"}), "no usable camera topic"),
         (renamed({COLOR: DEPTH, DEPTH: COLOR}), "not foxglove.CompressedImage; replay it where"),
         (renamed(ROS2_NAMES, profile="ros2"), "ROS 2 wrote it"),
+        (renamed({}, number=lambda index: index // 5), "several views of index 0, 1; number them"),
     ],
 )
 def test_recordings_that_cannot_be_used_are_refused(idle, content, why):

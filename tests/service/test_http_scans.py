@@ -9,7 +9,7 @@ import httpx2
 import numpy as np
 import pytest
 from fake_rig import FakeRig
-from live_service import BODY, PATHS, ask_again, problem, serving, wait_until
+from live_service import BODY, PATHS, ask_again, problem, read_events, serving, wait_until
 
 from service.http.requests import SpeedCaps
 from service.rig import RigNotReadyError, ScanState
@@ -441,6 +441,54 @@ def test_the_arm_is_commanded_even_if_the_catalogue_cannot_be_written(tmp_path):
         assert live.http.post(f"/v1/scans/{scan_id}:pause").json()["state"] == "paused"
         assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "paused"
         assert live.rig.status(scan_id).state is ScanState.PAUSED
+
+
+def fill_disk(folder):
+    """Let nothing be noted any more, as where there is no room."""
+    with closing(sqlite3.connect(folder / "catalogue.sqlite")) as other:
+        for name, what in (("full", "UPDATE ON scans"), ("no_room", "INSERT ON events")):
+            other.execute(f"CREATE TRIGGER {name} BEFORE {what} BEGIN SELECT full_disk(); END")
+
+
+def make_room(folder):
+    with closing(sqlite3.connect(folder / "catalogue.sqlite")) as other:
+        for name in ("full", "no_room"):
+            other.execute(f"DROP TRIGGER {name}")
+
+
+def test_a_scan_whose_end_cannot_be_noted_has_ended(live, tmp_path, monkeypatch):
+    monkeypatch.setattr("service.http.scans._LAST_WORDS_UNNOTED_S", 0.2)
+    scan_id = live.start()
+    live.rig.photograph(scan_id, 0)
+    with live.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
+        events = read_events(stream)
+        assert [next(events)["event"] for _ in range(2)] == ["started", "view"]
+        fill_disk(tmp_path)
+        live.rig.finish(scan_id)
+        assert next(events)["event"] == "end"
+    assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "done"
+    assert live.http.get("/v1/rig").json()["scan"] is None
+    problem(live.http.post(f"/v1/scans/{scan_id}:cancel"), 409, "scan_over")
+    assert live.rig.status(scan_id).state is ScanState.DONE
+    make_room(tmp_path)
+    assert live.http.post("/v1/replays", json={"scan_id": scan_id}).status_code == 202
+
+
+def test_an_end_that_cannot_be_noted_at_once_is_noted_when_there_is_room(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.replays._AGAIN_S", 0.1)
+    with serving(tmp_path) as live:
+        scan_id = live.start()
+        with live.http.stream("GET", f"/v1/scans/{scan_id}/events") as stream:
+            events = read_events(stream)
+            assert next(events)["event"] == "started"
+            fill_disk(tmp_path)
+            live.rig.finish(scan_id)
+            wait_until(lambda: live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "done")
+            make_room(tmp_path)
+            assert [event["event"] for event in events] == ["done", "end"]
+    with serving(tmp_path, FakeRig()) as live:
+        assert live.http.get(f"/v1/scans/{scan_id}").json()["state"] == "done"
+        assert live.rig.holds == []
 
 
 def test_readiness_names_what_is_missing(live):

@@ -1,11 +1,14 @@
 """Scans through the real ur-rtde client against the fake controller."""
 
+import errno
 import json
+import os
 import re
 import socket
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from scenes.wood import view_from
 
 from canopy_skel.geometry import invert
 from canopy_skel.pipeline import MethodConfig
-from canopy_skel.recording import carry_over, read_recording
+from canopy_skel.recording import carry_over, messages_of_view, read_recording
 from drivers import kinematics
 from drivers.errors import CameraTimeoutError
 from drivers.guarded_arm import GuardedArm, Limits
@@ -83,6 +86,7 @@ class Collected:
 
     def __init__(self):
         self.offered = []
+        self.messages = {}
 
     def begin(self, spec, path):
         pass
@@ -90,8 +94,9 @@ class Collected:
     def catch_up(self, spec, path):
         pass
 
-    def offer(self, scan_id, index):
+    def offer(self, scan_id, index, messages):
         self.offered.append(index)
+        self.messages[scan_id, index] = messages
 
     def skeleton(self, scan_id):
         return None
@@ -190,6 +195,8 @@ def test_a_scan_visits_its_waypoints_and_records_what_it_saw(rig, fake):
         np.testing.assert_allclose(view.base_from_camera, pose, atol=2e-4)
         assert abs(view.stamp_ns - time.time_ns()) < 60e9
     assert rig.feed.offered == [0, 1, 2, 3]
+    for index in range(4):  # nobody has to read them again
+        assert rig.feed.messages["scan-1", index] == messages_of_view(recording, index)
     assert [kind for kind, _ in rig.events].count("view") == 4
     assert rig.events[-1][0] == "done"
     assert recording.metadata["tree_id"] == "t1"
@@ -299,6 +306,48 @@ def test_a_cancelled_scan_keeps_its_views_and_does_not_go_on(rig):
         rig.resume("scan-1")
 
 
+def test_a_scan_that_is_done_is_not_cancelled_any_more(rig):
+    rig.start(spec())
+    wait_for(rig, "scan-1", ScanState.DONE)
+    assert rig.cancel("scan-1").state is ScanState.DONE
+    assert rig.status("scan-1").state is ScanState.DONE
+
+
+@pytest.mark.parametrize("step", ["rename", "unlink", "exists"])
+def test_a_disk_that_went_read_only_stops_the_scan_and_costs_nothing(rig, monkeypatch, step):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    before = rig.pause("scan-1").views_done
+
+    def refused(path, *more, **options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, step, refused)
+        rig.resume("scan-1")
+        until = time.perf_counter() + 10
+        while rig.status("scan-1").state is ScanState.RUNNING:
+            assert time.perf_counter() < until
+        detail = rig.status("scan-1").detail
+        assert rig.status("scan-1").state is ScanState.STOPPED
+    assert "Read-only file system" in detail
+    assert step == "exists" or re.search(r"/scan-1\.mcap\S*: cannot be written .* check", detail)
+    with pytest.raises(RigNotReadyError, match="acknowledge"):
+        rig.resume("scan-1")
+    rig.acknowledge("remounted")
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    assert len(views_of(rig, "scan-1")) == 4 > before
+
+
+def test_a_folder_that_went_away_makes_the_disk_not_ready(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: Path("/nowhere/at/all").stat())
+    part = {part.name: part for part in rig.parts()}["disk"]
+    assert not part.ready
+    assert f"{tmp_path}: cannot be written (No such file or directory); check" in part.detail
+
+
 def test_a_second_scan_is_refused(rig):
     rig.start(spec())
     with pytest.raises(RigBusyError, match="scan scan-1 is under way"):
@@ -360,7 +409,7 @@ def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, m
 
 def test_a_scan_that_cannot_begin_leaves_the_rig_free(rig, tmp_path):
     (tmp_path / "scans").write_bytes(b"no folder")
-    with pytest.raises(NotADirectoryError):
+    with pytest.raises(RigNotReadyError, match=r"disk: .*scan-1: cannot be written .* check the"):
         rig.start(spec())
     (tmp_path / "scans").unlink()
     rig.start(spec("scan-2"))
@@ -545,6 +594,28 @@ def test_what_a_killed_service_left_is_carried_on(rig):
     after = {v.index: v.depth_m.tobytes() for v in views_of(rig, "scan-1")}
     assert set(after) == {0, 1, 2, 3}
     assert all(after[index] == data for index, data in before.items())
+
+
+def test_what_was_set_aside_is_gone_for_good_before_more_is_recorded(rig, camera, monkeypatch):
+    """A power cut undoes what was not synced; the name of a file is synced with its folder."""
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    folder, synced_names, sync = rig.recording_path("scan-1").parent, [], os.fsync
+
+    def synced(descriptor):
+        sync(descriptor)
+        if os.path.samestat(os.fstat(descriptor), folder.stat()):
+            names = {path.suffix for path in folder.iterdir()}
+            synced_names.append((names, camera.grabs))
+
+    grabs = camera.grabs
+    monkeypatch.setattr(os, "fsync", synced)
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE).views_done == 4
+    # The new file's name first, or there might be neither.
+    assert synced_names[:2] == [({".aside", ".part"}, grabs), ({".part"}, grabs)]
 
 
 def test_the_count_of_views_never_falls_while_a_scan_is_taken_up_again(rig, monkeypatch):

@@ -1,11 +1,15 @@
 """Bad input gets one line that names file, topic, view and mend; it never costs other views."""
 
+import os
 import re
+import struct
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
 from canopy_skel.document import RejectedView
@@ -18,7 +22,7 @@ from canopy_skel.messages import (
     encode_scores,
     encode_transforms,
 )
-from canopy_skel.recording import TopicOptions, mcap_file, read_recording
+from canopy_skel.recording import RecordingWriter, TopicOptions, mcap_file, read_recording
 
 COLOR, DEPTH, TF = "/camera/color/image", "/camera/depth/image", "/tf"
 INSTANCES, SCORES = "/camera/branches/instances", "/camera/branches/scores"
@@ -82,6 +86,19 @@ def test_no_such_file(tmp_path):
 def test_a_folder_is_no_recording(tmp_path):
     with pytest.raises(RecordingError, match=r"is a folder; name the MCAP file in it$"):
         read_recording(tmp_path)
+
+
+def test_a_disk_that_does_not_give_what_it_has(kit, tmp_path):
+    """The memory of this process opens well and cannot be read at its beginning: EIO."""
+    (tmp_path / "bad.mcap").symlink_to("/proc/self/mem")
+    with pytest.raises(RecordingError, match=r"bad\.mcap: cannot be read \(Input/output error\)"):
+        read_recording(tmp_path / "bad.mcap")
+    recording = read_recording(kit.write(tmp_path / "turned_bad.mcap"))
+    recording.path.unlink()
+    recording.path.symlink_to("/proc/self/mem")
+    for ask in (lambda: recording.view(0), lambda: recording.ground_truth):
+        with pytest.raises(RecordingError, match=r"turned_bad\.mcap: cannot be read"):
+            ask()
 
 
 @pytest.mark.parametrize(
@@ -400,6 +417,45 @@ def test_only_a_pair_makes_the_left_camera_the_colour_camera(kit, tmp_path):
     ):
         grey = np.repeat(written.stereo.left_mono[..., None], 3, axis=2)
         kit.assert_same_view(view, replace(written, color_rgb=grey, depth_m=None))
+
+
+@pytest.mark.parametrize("opcode", [0x80, Opcode.ATTACHMENT, Opcode.CHUNK, Opcode.METADATA])
+def test_a_record_that_is_larger_than_memory_is_passed_over(kit, tmp_path, opcode):
+    whole = kit.write(tmp_path / "a.mcap").read_bytes()
+    after_header = 17 + struct.unpack_from("<Q", whole, 9)[0]
+    size = mcap_file.MOST_CHUNK_BYTES + 1
+    with (tmp_path / "b.mcap").open("wb") as stream:
+        stream.write(whole[:after_header] + struct.pack("<BQ", opcode, size))
+        stream.seek(size, os.SEEK_CUR)
+        stream.write(whole[after_header:])
+    tracemalloc.start()
+    try:
+        found = list(read_recording(tmp_path / "b.mcap").views())
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < size / 8
+    for view, written in zip(found, kit.views, strict=True):
+        kit.assert_same_view(view, written)
+
+
+def test_an_attachment_is_checked_piece_by_piece(kit, tmp_path):
+    content = np.random.default_rng(0).bytes(3_000_000)
+    for beyond in (0, 2, 4):  # bytes of its checksum that are in a piece of their own
+        data = content[: (1 << 21) - 51 + beyond]
+        path = tmp_path / f"{beyond}.mcap"
+        with RecordingWriter(path, {}, tool_from_camera=kit.tool_from_camera) as writer:
+            writer.write_view(kit.views[0], kit.as_png(kit.views[0]))
+            writer.attach("large", "text/plain", data)
+        recording = read_recording(path)
+        assert recording.warnings == ()
+        assert recording.attachment("large") == data
+        damaged = bytearray(path.read_bytes())
+        damaged[damaged.index(data[:100]) + 1_500_000] ^= 1
+        path.write_bytes(damaged)
+        recording = read_recording(path)
+        assert recording.attachment("large") is None
+        assert "checksum of 'large' does not match" in recording.warnings[0]
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])

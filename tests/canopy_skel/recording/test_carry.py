@@ -1,10 +1,13 @@
 """A new recording goes on from an unfinished one: nothing in it changes, nothing half is taken."""
 
+import struct
+
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from canopy_skel.errors import RecordingError
-from canopy_skel.recording import RecordingWriter, carry_over, read_recording
+from canopy_skel.recording import RecordingWriter, carry_over, read_recording, recover
 
 
 def content(path, *, journal):
@@ -59,6 +62,62 @@ def test_a_view_lost_in_its_chunk_is_not_carried_but_its_journal_is(scanned, tmp
     assert content(tmp_path / "new.mcap", journal=False) == [row for row in views if row[1] < 2]
     events = content(scanned, journal=True)
     assert content(tmp_path / "new.mcap", journal=True) == events[:3]
+
+
+def chunks_of(content):
+    """Return start and end of every chunk, also of a file without an end."""
+    found, offset = [], 8
+    while offset + 9 <= len(content):
+        opcode, length = struct.unpack_from("<BQ", content, offset)
+        if opcode == Opcode.CHUNK:
+            found.append((offset, offset + 9 + length))
+        offset += 9 + length
+    return found
+
+
+def damage(path, whole, place):
+    """Write a recording with one byte changed."""
+    damaged = bytearray(whole)
+    damaged[place] ^= 0xFF
+    path.write_bytes(damaged)
+    return path
+
+
+@pytest.fixture
+def unfinished(kit, tmp_path):
+    """What is on disk in the middle of a scan: views 0, 1, 2 and the journal around them."""
+    path = tmp_path / "unfinished.mcap"
+    with RecordingWriter(path, {}, tool_from_camera=kit.tool_from_camera) as writer:
+        writer.write_event(5, {"kind": "running"})
+        for view in kit.views[:3]:
+            writer.write_view(view, kit.as_png(view))
+            writer.write_event(view.stamp_ns + 1, {"kind": "view", "index": view.index})
+        return path.with_name(path.name + ".part").read_bytes()
+
+
+@pytest.mark.parametrize("damaged", range(7))  # entry, view 0, entry, view 1, ...
+def test_a_damaged_chunk_costs_what_is_in_it_and_nothing_else(kit, unfinished, tmp_path, damaged):
+    chunks = chunks_of(unfinished)
+    assert len(chunks) == 7
+    part = damage(tmp_path / "bad.mcap.part", unfinished, sum(chunks[damaged]) // 2)
+    left = [index for index in range(3) if damaged != 2 * index + 1]
+    found = list(read_recording(part).views())
+    assert [view.index for view in found] == left
+    for view in found:
+        kit.assert_same_view(view, kit.views[view.index])
+    assert recover(part, tmp_path / "good.mcap").views_saved == len(left)
+    assert carried(part, tmp_path / "new.mcap") == tuple(left)
+    assert len(content(tmp_path / "new.mcap", journal=True)) == 4 - (damaged % 2 == 0)
+
+
+def test_messages_of_which_nobody_knows_what_they_are_are_not_left_behind(kit, tmp_path):
+    """Before the journal repeated the channels, damage in the first view could take them all."""
+    messages = [m for view in kit.views[:3] for m in kit.messages_of(view).values()]
+    path = kit.write_raw(tmp_path / "old.mcap", messages, chunk_size=3000, repeat_channels=False)
+    whole = path.read_bytes()
+    damage(path, whole, sum(chunks_of(whole)[0]) // 2)
+    with pytest.raises(RecordingError, match=r"old\.mcap: is damaged where it says what \d+ of"):
+        carried(path, tmp_path / "new.mcap")
 
 
 def test_a_half_written_view_is_not_carried(kit, tmp_path):
