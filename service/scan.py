@@ -147,17 +147,22 @@ class ScanSession:
         """Stop the arm at once and end the session as `wanted`.
 
         When this returns, the session begins no further motion. The first stop does not wait for
-        the lock, which is held while a move is being begun; the second is for that move. A session
-        that has ended moves nothing: the arm may be another's.
+        the lock, which is held while a move is being begun; the second is for that move, also where
+        the first has failed. A session that has ended moves nothing: the arm may be another's.
+
+        Raises:
+            DriverError: a stop was not confirmed.
         """
         if not self.running:
             return
         self._wanted = self._wanted or wanted
-        self._tools.arm.stop()
-        with self._lock:
-            under_way = self._state is ScanState.RUNNING
-        if under_way:
+        try:
             self._tools.arm.stop()
+        finally:
+            with self._lock:
+                under_way = self._state is ScanState.RUNNING
+            if under_way:
+                self._tools.arm.stop()
 
     def conclude(self, state: ScanState) -> None:
         """Set the state of a session that does not run: an operator's decision, or a take-over."""
@@ -269,6 +274,9 @@ class ScanSession:
             with stage("command"), self._lock:
                 self._check_wanted()
                 arm.start_move(move)
+                if self._wanted is not None:  # a stop since then was too early, or has failed
+                    arm.stop()
+                    self._check_wanted()
             with stage("settle"):
                 timeout_s = SLOWED_DOWN * travel_s(state, move) + spec.settle_timeout_s
                 state = wait_settled(arm, timeout_s=timeout_s)

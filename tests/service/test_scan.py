@@ -15,8 +15,8 @@ from canopy_skel.geometry import invert
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import carry_over, read_recording
 from drivers import kinematics
-from drivers.errors import CameraTimeoutError
-from drivers.guarded_arm import GuardedArm, Limits
+from drivers.errors import CameraTimeoutError, NotConnectedError
+from drivers.guarded_arm import GuardedArm, Limits, check
 from drivers.protocols import CameraImage
 from drivers.ur5.arm import Ur5Arm
 from drivers.ur5.dashboard import Dashboard
@@ -356,6 +356,33 @@ def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, m
     assert wait_for(rig, "scan-1", ScanState.STOPPED).views_done == 0
     assert fake.do("state")["joints_rad"] == before
     assert_stands_still(fake)
+
+
+def test_a_stop_that_fails_while_a_move_is_being_begun_is_made_good(rig, fake, monkeypatch):
+    """The arm cannot be told in the one moment in which there is nothing to stop yet."""
+    beginning, unheard, stop = threading.Event(), threading.Event(), Ur5Arm.stop
+
+    def slowly(*arguments):
+        beginning.set()
+        assert unheard.wait(5.0)
+        check(*arguments)
+
+    def not_at_first(arm):
+        if not unheard.is_set():
+            unheard.set()
+            raise NotConnectedError("stop not confirmed: use the emergency stop")
+        stop(arm)
+
+    monkeypatch.setattr("drivers.guarded_arm.check", slowly)
+    monkeypatch.setattr(Ur5Arm, "stop", not_at_first)
+    before = fake.do("state")["joints_rad"]
+    rig.start(spec(speed_mps=0.005))
+    assert beginning.wait(5.0)
+    with pytest.raises(RigNotReadyError, match="use the emergency stop"):
+        rig.stop()
+    assert wait_for(rig, "scan-1", ScanState.STOPPED).views_done == 0
+    assert_stands_still(fake)
+    np.testing.assert_allclose(fake.do("state")["joints_rad"], before, atol=0.02)
 
 
 def test_a_scan_that_cannot_begin_leaves_the_rig_free(rig, tmp_path):
