@@ -86,6 +86,14 @@ class RigParts:
     stage: Stage = lambda name: nullcontext()
 
 
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Since:
+    """How often the arm was stopped, and the newest wish that a scan should not run."""
+
+    stops: int
+    called_off: object
+
+
 class LocalRig:
     """See `service.rig.Rig`. A context manager; leaving it stops the arm and the scan."""
 
@@ -95,6 +103,8 @@ class LocalRig:
         self._arm, self._camera = Opened(parts.arm), Opened(parts.camera)
         self._open = ExitStack()
         self._sessions: dict[str, tuple[ScanSpec, ScanSession]] = {}
+        self._launching = threading.Lock()  # held for a moment only, never while a driver is asked
+        self._called_off: dict[str, object] = {}
         self._stopped, self._stops = "", 0
         self._listeners: list[Callable[[RigEvent], None]] = []
 
@@ -146,8 +156,8 @@ class LocalRig:
 
     def start(self, spec: ScanSpec, views_before: int = 0) -> ScanStatus:
         """Begin a scan; see `Rig.start`."""
+        since = self._since(spec.scan_id)
         with self._lock:
-            stops = self._stops
             self._require_free()
             self._require_ready()
             verdicts = self.plan(spec)
@@ -158,28 +168,28 @@ class LocalRig:
                     f" waypoint {bad[0].index}: {bad[0].reason}",
                     verdicts,
                 )
-            return self._launch(spec, stops, views_before)
+            return self._launch(spec, since, views_before)
 
     def pause(self, scan_id: str) -> ScanStatus:
-        """Stop the arm and keep the scan."""
-        _, session = self._session(scan_id)
+        """Stop the arm and keep the scan; a start that is under way comes to nothing."""
+        session = self._call_off(scan_id)
         self._interrupt(session, ScanState.PAUSED)
         return session.status
 
     def resume(self, scan_id: str) -> ScanStatus:
         """Go on at the first missing waypoint."""
+        since = self._since(scan_id)
         with self._lock:
-            stops = self._stops
             spec, session = self._session(scan_id)
             if session.status.state in FINISHED:
                 raise RigNotReadyError(f"scan {scan_id} is {session.status.state}; start a new one")
             self._require_free()
             self._require_ready()
-            return self._launch(spec, stops, session.status.views_done)
+            return self._launch(spec, since, session.status.views_done)
 
     def cancel(self, scan_id: str) -> ScanStatus:
         """Stop the arm and end the scan; what was recorded stays."""
-        _, session = self._session(scan_id)
+        session = self._call_off(scan_id)
         self._interrupt(session, ScanState.CANCELLED)
         session.conclude(ScanState.CANCELLED)
         return session.status
@@ -280,28 +290,52 @@ class LocalRig:
         """Tell the listeners of something that happened elsewhere, such as a new skeleton."""
         self._tell(scan_id, kind, fields)
 
-    def _launch(self, spec: ScanSpec, stops: int, views_before: int) -> ScanStatus:
-        """Start a session, unless the arm was stopped since `stops` was read.
+    def _since(self, scan_id: str) -> _Since:
+        """Return what a start must find unchanged in the end; read before anything is waited for.
+
+        The camera may take half a minute to be there: time enough to call the start off.
+        """
+        return _Since(stops=self._stops, called_off=self._called_off.get(scan_id))
+
+    def _call_off(self, scan_id: str) -> ScanSession:
+        """Have a start of this scan that is under way come to nothing; return its session."""
+        with self._launching:
+            self._called_off[scan_id] = object()
+            return self._session(scan_id)[1]
+
+    def _launch(self, spec: ScanSpec, since: _Since, views_before: int) -> ScanStatus:
+        """Start a session, unless the arm was stopped or the scan called off in the meantime.
 
         The session is there to be stopped before that is looked at: no stop falls in between.
         """
         before = self._sessions.get(spec.scan_id)
         session = self._session_for(spec, views_before, before[1].exposed_ns if before else {})
         session.path.parent.mkdir(parents=True, exist_ok=True)
-        self._sessions[spec.scan_id] = (spec, session)
-        try:
-            if self._stops != stops:
-                self._require_ready()
-                raise RigNotReadyError("arm: it was stopped meanwhile; look at it, then try again")
-            self._parts.feed.begin(spec, session.path)
-            session.start()
-        except Exception:
-            if before is None:
-                del self._sessions[spec.scan_id]
-            else:
-                self._sessions[spec.scan_id] = before
-            raise
+        with self._launching:
+            self._sessions[spec.scan_id] = (spec, session)
+            try:
+                self._require_unchanged(spec.scan_id, since)
+                self._parts.feed.begin(spec, session.path)
+                session.start()
+            except Exception:
+                if before is None:
+                    del self._sessions[spec.scan_id]
+                else:
+                    self._sessions[spec.scan_id] = before
+                raise
         return session.status
+
+    def _require_unchanged(self, scan_id: str, since: _Since) -> None:
+        if self._called_off.get(scan_id) is not since.called_off:
+            raise RigNotReadyError(f"scan {scan_id} was paused or cancelled meanwhile")
+        if self._stops != since.stops:
+            held = self._hold() or "it was stopped meanwhile; look at it, then try again"
+            raise RigNotReadyError(f"arm: {held}")
+
+    def _hold(self) -> str:
+        """Return why nothing may move, whatever the arm says; nothing if it may."""
+        stopped = self._stopped
+        return stopped and f"{stopped}: look at the arm, then acknowledge with a reason"
 
     def _session_for(
         self, spec: ScanSpec, views_before: int, exposed_before: Mapping[int, int]
@@ -364,9 +398,7 @@ class LocalRig:
                 raise RigNotReadyError(f"{part.name}: {part.detail}")
 
     def _arm_status(self) -> PartStatus:
-        detail = _trouble(self._arm)
-        if not detail and self._stopped:
-            detail = f"{self._stopped}: look at the arm, then acknowledge with a reason"
+        detail = _trouble(self._arm) or self._hold()
         return PartStatus(name="arm", ready=not detail, detail=detail)
 
     def _camera_status(self) -> PartStatus:

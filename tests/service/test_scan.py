@@ -358,6 +358,38 @@ def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, m
     assert_stands_still(fake)
 
 
+@pytest.mark.parametrize(
+    ("ask", "state"),
+    [(LocalRig.pause, ScanState.PAUSED), (LocalRig.cancel, ScanState.CANCELLED)],
+)
+def test_a_resume_that_waits_for_the_camera_can_be_called_off(rig, fake, camera, ask, state):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    waiting, there, refusals = threading.Event(), threading.Event(), []
+
+    def opening():
+        waiting.set()
+        assert there.wait(5.0)
+
+    def resume():
+        with pytest.raises(RigNotReadyError) as refused:
+            rig.resume("scan-1")
+        refusals.append(str(refused.value))
+
+    camera.check = opening
+    resuming = threading.Thread(target=resume)
+    resuming.start()
+    assert waiting.wait(5.0)
+    assert ask(rig, "scan-1").state is state
+    there.set()
+    resuming.join(5.0)
+    assert refusals == ["scan scan-1 was paused or cancelled meanwhile"]
+    assert rig.status("scan-1").state is state
+    assert_stands_still(fake)
+
+
 def test_a_stop_that_fails_while_a_move_is_being_begun_is_made_good(rig, fake, monkeypatch):
     """The arm cannot be told in the one moment in which there is nothing to stop yet."""
     beginning, unheard, stop = threading.Event(), threading.Event(), Ur5Arm.stop
