@@ -14,7 +14,7 @@ from canopy_skel.geometry import FloatArray
 from canopy_skel.recording.writer import publish
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
-from drivers.protocols import Arm, Camera, ToolPose
+from drivers.protocols import Arm, ArmMode, Camera, ToolPose, raise_unless_movable
 from drivers.waypoints import after, moves_to
 from service.opened import Opened
 from service.rig import (
@@ -212,8 +212,26 @@ class LocalRig:
         self._stopped = self._stopped or reason
         self._stops += 1
 
+    def end_held(self) -> None:
+        """End a scan whose arm is held, and starts under way; see `Rig.end_held`.
+
+        A scan that waits for its camera meanwhile has not met the hold, and would never know of it.
+        """
+        try:
+            state = self._parts.arm.state()
+            raise_unless_movable(state, also=(ArmMode.MOVING, ArmMode.INTERRUPTED))
+        except DriverError as error:
+            with self._launching:
+                self._stops += 1
+                running = [session for _, session in self._sessions.values() if session.running]
+            for session in running:
+                session.give_up(error)
+            for session in running:
+                self._join(session, "the arm is held")
+
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again; a scan goes on only by `resume`."""
+        self.end_held()
         stops = self._stops
         try:
             self._arm.open()
@@ -371,10 +389,13 @@ class LocalRig:
             session.interrupt(wanted)
         except DriverError as error:
             raise _not_ready(error) from error
+        self._join(session, "the arm was told to stop")
+
+    def _join(self, session: ScanSession, why: str) -> None:
         if not session.join(STOP_TIMEOUT_S):
             raise RigNotReadyError(
-                "the arm was told to stop but the scan has not ended within"
-                f" {STOP_TIMEOUT_S:.0f} s; look at the arm, then try again"
+                f"{why} but the scan has not ended within {STOP_TIMEOUT_S:.0f} s;"
+                " look at the arm, then try again"
             )
 
     def _session(self, scan_id: str) -> tuple[ScanSpec, ScanSession]:

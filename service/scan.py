@@ -102,6 +102,7 @@ class ScanSession:
         self._recorded = recorded
         self._conclude_with = conclude_with
         self._wanted: ScanState | None = None
+        self._held: DriverError | None = None
         self._state = ScanState.RUNNING
         self._detail = ""
         self._done: set[int] = set()
@@ -163,6 +164,13 @@ class ScanSession:
                 under_way = self._state is ScanState.RUNNING
             if under_way:
                 self._tools.arm.stop()
+
+    def give_up(self, held: DriverError) -> None:
+        """End the session with what holds the arm, which it need not have met itself.
+
+        It begins no further motion, also when the arm is let go; `join` tells when it has ended.
+        """
+        self._held = held
 
     def conclude(self, state: ScanState) -> None:
         """Set the state of a session that does not run: an operator's decision, or a take-over."""
@@ -274,7 +282,7 @@ class ScanSession:
             with stage("command"), self._lock:
                 self._check_wanted()
                 arm.start_move(move)
-                if self._wanted is not None:  # a stop since then was too early, or has failed
+                if self._wanted or self._held:  # a stop since then was too early, or has failed
                     arm.stop()
                     self._check_wanted()
             with stage("settle"):
@@ -286,6 +294,7 @@ class ScanSession:
         reasons: list[str] = []
         for attempt in range(self._spec.retakes + 1):
             self._check_wanted()
+            raise_unless_movable(before, also=(ArmMode.INTERRUPTED,))
             with self._tools.stage("grab"):
                 image = self._tools.camera.grab(self._spec.grab_timeout_s)
             with self._tools.stage("gate"):
@@ -320,6 +329,8 @@ class ScanSession:
     def _check_wanted(self) -> None:
         if self._wanted is not None:
             raise ScanInterruptedError(f"{self._wanted} by the operator")
+        if self._held is not None:
+            raise self._held
 
     def _note(self, writer: RecordingWriter, kind: str, **fields: object) -> None:
         writer.write_event(time.time_ns(), {"kind": kind, **fields})

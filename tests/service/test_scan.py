@@ -9,6 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from live_rig import waypoint
+from live_service import serving
 from scenes.wood import view_from
 
 from canopy_skel.geometry import invert
@@ -23,6 +25,7 @@ from drivers.ur5.dashboard import Dashboard
 from drivers.ur5.messages import Ur5Config
 from mock_hw.fake_ur.process import FakeUr, free_host
 from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
+from service.catalogue import Catalogue
 from service.local_rig import LocalRig, RigParts
 from service.rig import (
     PartStatus,
@@ -358,11 +361,110 @@ def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, m
     assert_stands_still(fake)
 
 
+class BlockedCamera:
+    """Lets the first picture wait, as while the camera's process is replaced."""
+
+    def __init__(self, camera):
+        self._grab, self.waiting, self.there = camera.grab, threading.Event(), threading.Event()
+        camera.grab = self.grab
+
+    def grab(self, timeout_s):
+        self.waiting.set()
+        assert self.there.wait(timeout_s)
+        return self._grab(timeout_s)
+
+
+def open_and_close_the_door(rig, fake):
+    fake.do("safeguard_stop")
+    while "safeguard" not in rig.parts()[0].detail:
+        time.sleep(0.01)
+    fake.do("close_safeguard")
+    while "not acknowledged" not in rig.parts()[0].detail:
+        time.sleep(0.01)
+
+
+def start_over_http(http, count=4):
+    poses = [waypoint(pose) for pose in WAYPOINTS[:count]]
+    body = {"tree_id": "t1", "waypoints": poses, "segmenter": "recorded"}
+    answer = http.post("/v1/scans", json=body, headers={"Idempotency-Key": "k"})
+    assert answer.status_code == 202, answer.text
+    return answer.json()["scan_id"]
+
+
+def acknowledge(http):
+    return http.post("/v1/rig:acknowledge", json={"reason": "all out, way is clear"})
+
+
+def test_an_acknowledgement_alone_moves_nothing(rig, fake, camera, tmp_path):
+    """The door opens and closes again while a scan waits for its camera, and never meets it."""
+    blocked = BlockedCamera(camera)
+    with serving(tmp_path / "state", rig) as live:
+        scan_id = start_over_http(live.http)
+        assert blocked.waiting.wait(20.0)
+        open_and_close_the_door(rig, fake)
+        before = fake.do("state")["joints_rad"]
+        threading.Timer(0.3, blocked.there.set).start()
+        assert acknowledge(live.http).status_code == 200
+        status = wait_for(rig, scan_id, ScanState.STOPPED, ScanState.DONE)
+        assert (status.state, status.views_done) == (ScanState.STOPPED, 1)
+        assert "not acknowledged: safeguard stop" in status.detail
+        assert_stands_still(fake)
+        assert fake.do("state")["joints_rad"] == before
+        assert live.http.post(f"/v1/scans/{scan_id}:resume").status_code == 200
+        assert wait_for(rig, scan_id, ScanState.DONE, ScanState.STOPPED).state is ScanState.DONE
+    with Catalogue(tmp_path / "state") as catalogue:
+        assert catalogue.last_stop() == 0
+
+
+def test_an_acknowledgement_is_refused_until_the_scan_has_ended(rig, fake, camera, monkeypatch):
+    blocked = BlockedCamera(camera)
+    rig.start(spec())
+    assert blocked.waiting.wait(20.0)
+    open_and_close_the_door(rig, fake)
+    with monkeypatch.context() as patched:
+        patched.setattr("service.local_rig.STOP_TIMEOUT_S", 0.2)
+        with pytest.raises(RigNotReadyError, match="the scan has not ended within"):
+            rig.acknowledge("all out")
+    blocked.there.set()
+    assert wait_for(rig, "scan-1", ScanState.STOPPED).views_done == 1
+    assert_stands_still(fake)
+    rig.acknowledge("all out")
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE, ScanState.STOPPED).state is ScanState.DONE
+
+
+def test_no_picture_is_taken_again_while_the_arm_is_held(rig, fake, camera, monkeypatch):
+    grab = camera.grab
+
+    def meanwhile(timeout_s):
+        fake.do("safeguard_stop")
+        while rig.parts()[0].ready:
+            time.sleep(0.01)
+        return grab(timeout_s)
+
+    monkeypatch.setattr(camera, "grab", meanwhile)
+    camera.spoiled = 99
+    rig.start(spec())
+    assert "SafeguardStopError" in wait_for(rig, "scan-1", ScanState.STOPPED).detail
+    assert camera.grabs == 1
+
+
+def acknowledge_a_door(rig, fake):
+    open_and_close_the_door(rig, fake)
+    rig.acknowledge("all out, way is clear")
+
+
 @pytest.mark.parametrize(
-    ("ask", "state"),
-    [(LocalRig.pause, ScanState.PAUSED), (LocalRig.cancel, ScanState.CANCELLED)],
+    ("meanwhile", "state", "why"),
+    [
+        (lambda rig, fake: rig.pause("scan-1"), ScanState.PAUSED, "was paused or cancelled"),
+        (lambda rig, fake: rig.cancel("scan-1"), ScanState.CANCELLED, "was paused or cancelled"),
+        (acknowledge_a_door, ScanState.PAUSED, "arm: it was stopped meanwhile"),
+    ],
 )
-def test_a_resume_that_waits_for_the_camera_can_be_called_off(rig, fake, camera, ask, state):
+def test_a_resume_that_waits_for_the_camera_can_be_called_off(
+    rig, fake, camera, meanwhile, state, why
+):
     rig.start(spec())
     while rig.status("scan-1").views_done < 1:
         time.sleep(0.005)
@@ -370,8 +472,9 @@ def test_a_resume_that_waits_for_the_camera_can_be_called_off(rig, fake, camera,
     waiting, there, refusals = threading.Event(), threading.Event(), []
 
     def opening():
-        waiting.set()
-        assert there.wait(5.0)
+        if threading.current_thread() is resuming:
+            waiting.set()
+            assert there.wait(5.0)
 
     def resume():
         with pytest.raises(RigNotReadyError) as refused:
@@ -382,10 +485,12 @@ def test_a_resume_that_waits_for_the_camera_can_be_called_off(rig, fake, camera,
     resuming = threading.Thread(target=resume)
     resuming.start()
     assert waiting.wait(5.0)
-    assert ask(rig, "scan-1").state is state
+    meanwhile(rig, fake)
+    assert rig.status("scan-1").state is state
     there.set()
     resuming.join(5.0)
-    assert refusals == ["scan scan-1 was paused or cancelled meanwhile"]
+    assert len(refusals) == 1
+    assert why in refusals[0]
     assert rig.status("scan-1").state is state
     assert_stands_still(fake)
 
