@@ -106,6 +106,7 @@ class LocalRig:
         self._launching = threading.Lock()  # held for a moment only, never while a driver is asked
         self._called_off: dict[str, object] = {}
         self._stopped, self._stops = "", 0
+        self._ending = False
         self._listeners: list[Callable[[RigEvent], None]] = []
 
     def __enter__(self) -> "LocalRig":
@@ -120,13 +121,7 @@ class LocalRig:
 
     def __exit__(self, *reasons: object) -> None:
         """End a scan under way, keeping its recording, and close arm and camera."""
-        for scan_id in [*self._sessions]:
-            session = self._sessions[scan_id][1]
-            if session.status.state is ScanState.RUNNING:
-                try:
-                    self._interrupt(session, ScanState.PAUSED)
-                except RigNotReadyError as error:
-                    log.warning("scan %s: %s", scan_id, error)
+        self.end()
         self._open.close()
 
     def plan(self, spec: ScanSpec) -> list[WaypointVerdict]:
@@ -242,6 +237,17 @@ class LocalRig:
             self._stopped = ""
         self._tell("", "acknowledged", {"reason": reason})
 
+    def end(self) -> None:
+        """Pause the scan under way and start none any more; see `Rig.end`."""
+        with self._launching:
+            self._ending = True
+            running = [session for _, session in self._sessions.values() if session.running]
+        for session in running:
+            try:
+                self._interrupt(session, ScanState.PAUSED)
+            except RigNotReadyError as error:
+                log.warning("a scan under way when the service ended: %s", error)
+
     def status(self, scan_id: str) -> ScanStatus:
         """Return the scan as it is."""
         return self._session(scan_id)[1].status
@@ -344,6 +350,8 @@ class LocalRig:
         return session.status
 
     def _require_unchanged(self, scan_id: str, since: _Since) -> None:
+        if self._ending:
+            raise RigNotReadyError("the service is ending")
         if self._called_off.get(scan_id) is not since.called_off:
             raise RigNotReadyError(f"scan {scan_id} was paused or cancelled meanwhile")
         if self._stops != since.stops:

@@ -193,6 +193,13 @@ class Rig(Protocol):
         """An operator has looked and says why moving is safe again. Raises RigNotReadyError."""
         ...
 
+    def end(self) -> None:
+        """The service is ending: pause the scan under way, and start none any more.
+
+        Returns when nothing moves, or when that cannot be had.
+        """
+        ...
+
     def status(self, scan_id: str) -> ScanStatus:
         """Return the scan as it is. Raises UnknownScanError."""
         ...

@@ -129,6 +129,9 @@ class FakeRig:
     def hold(self, reason: str) -> None:
         self.holds.append(reason)
 
+    def end(self) -> None:
+        pass
+
     def end_held(self) -> None:
         pass
 

@@ -5,8 +5,10 @@ import re
 import socket
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 
+import httpx2
 import numpy as np
 import pytest
 from live_rig import waypoint
@@ -383,9 +385,9 @@ def open_and_close_the_door(rig, fake):
         time.sleep(0.01)
 
 
-def start_over_http(http, count=4):
-    poses = [waypoint(pose) for pose in WAYPOINTS[:count]]
-    body = {"tree_id": "t1", "waypoints": poses, "segmenter": "recorded"}
+def start_over_http(http, **changes):
+    poses = [waypoint(pose) for pose in WAYPOINTS[:4]]
+    body = {"tree_id": "t1", "waypoints": poses, "segmenter": "recorded", **changes}
     answer = http.post("/v1/scans", json=body, headers={"Idempotency-Key": "k"})
     assert answer.status_code == 202, answer.text
     return answer.json()["scan_id"]
@@ -757,3 +759,34 @@ def test_stop_from_another_thread_ends_motion_at_once(rig, fake):
     assert not stopper.is_alive()
     wait_for(rig, "scan-1", ScanState.STOPPED)
     assert_stands_still(fake)
+
+
+def test_the_arm_stands_before_the_service_stops_answering(rig, fake, camera, tmp_path):
+    """Its camera keeps the scan from ending for a while; the service can be asked all along."""
+    blocked, service = BlockedCamera(camera), ExitStack()
+    live = service.enter_context(serving(tmp_path / "state", rig))
+    scan_id = start_over_http(live.http)
+    assert blocked.waiting.wait(20.0)
+    ending = threading.Thread(target=service.close)
+    ending.start()
+    time.sleep(0.5)
+    assert httpx2.post(f"{live.url}/v1/rig:stop").status_code == 200
+    blocked.there.set()
+    ending.join(10.0)
+    assert not ending.is_alive()
+    assert rig.status(scan_id).state is ScanState.PAUSED
+    with Catalogue(tmp_path / "state") as catalogue:
+        assert catalogue.scan(scan_id).state is ScanState.PAUSED
+    with pytest.raises(httpx2.ConnectError):
+        httpx2.post(f"{live.url}/v1/rig:stop")
+
+
+def test_a_service_that_ends_stops_the_arm_itself(rig, fake, tmp_path):
+    """The server has ended, arm and camera are open still: nothing else has stopped the arm."""
+    with serving(tmp_path / "state", rig) as live:
+        scan_id = start_over_http(live.http, speed_mps=0.005)
+        wait_until_moving(rig, fake)
+    assert rig.status(scan_id).state is ScanState.PAUSED
+    assert_stands_still(fake)
+    with pytest.raises(RigNotReadyError, match="the service is ending"):
+        rig.resume(scan_id)
