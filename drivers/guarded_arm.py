@@ -5,6 +5,7 @@ nobody wants.
 """
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import TracebackType
 from typing import Self
 
@@ -209,8 +210,7 @@ def _check_rates(move: Move, joints_rad: FloatArray, tool: FloatArray, limits: L
     turn_rad = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
     shift_m = _shifts_m(tool)
     if isinstance(move, LinearMove):
-        moving = shift_m[:, 0].sum() > _STAYS_M
-        step_s = shift_m[:, 0] / move.speed_mps * moving
+        step_s = _steps_s(joints_rad, shift_m[:, 0], move.speed_mps)
         fastest = _fastest(turn_rad, step_s)
         _cap("a joint's speed on this line,", fastest, limits.joint_speed_rps, "rad/s,")
         fastest = _fastest(shift_m.max(axis=1), step_s)
@@ -218,6 +218,20 @@ def _check_rates(move: Move, joints_rad: FloatArray, tool: FloatArray, limits: L
     else:
         fastest = _fastest(shift_m.max(axis=1), turn_rad / move.speed_rps)
         _cap("the tool's speed on this joint move,", fastest, limits.speed_mps, "m/s,")
+
+
+def _steps_s(joints_rad: FloatArray, shift_m: FloatArray, speed_mps: float) -> FloatArray:
+    """Return how long each step of a line takes whose flange moves by `shift_m` (N - 1,).
+
+    Where the flange stays, controllers turn at the number they are given for the speed, in rad/s.
+    """
+    if shift_m.sum() > _STAYS_M:
+        return shift_m / speed_mps
+    poses = [kinematics.forward(joints) for joints in joints_rad]
+    turns = [kinematics.relative_turn(*pair) for pair in pairwise(poses)]
+    turn_rad = np.linalg.norm([kinematics.rotation_vector(turn) for turn in turns], axis=1)
+    slower: FloatArray = np.maximum(turn_rad, shift_m)
+    return slower / speed_mps
 
 
 def _shifts_m(tool: FloatArray) -> FloatArray:

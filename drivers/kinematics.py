@@ -25,6 +25,10 @@ _D_M = (0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823)
 _A_M = (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0)
 _ALPHA_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 _LARGEST_STEP_RAD = 0.6
+_FINE_STEP_RAD = 0.1
+"""Of a joint near a singularity, where its speed changes quickly: the mean over less is near it."""
+_FINEST_FRACTION = 1e-6
+_BENT = 1e-3
 _STRAIGHT = 1e-9
 
 
@@ -157,10 +161,12 @@ def straight_joints(
 ) -> FloatArray:
     """Return joints (N, 6) along the straight line between two tool0 poses, both ends included.
 
+    One sample for each `step_m` and each 0.1 rad of turn; more where joints turn fast.
+
     Raises:
         UnreachableError: the end is out of reach, or the line leaves the reach or passes so close
             to a singularity, or to ±360° of a joint, that one would turn more than 0.6 rad
-            within one step.
+            within one step, or leads through a straight wrist.
     """
     goal = "({:.3f}, {:.3f}, {:.3f}) m".format(*base_from_end[:3, 3])
     if inverse(base_from_end, near_joints_rad) is None:
@@ -168,16 +174,38 @@ def straight_joints(
     length_m = float(np.linalg.norm(base_from_end[:3, 3] - base_from_start[:3, 3]))
     turn_rad = float(np.linalg.norm(rotation_vector(relative_turn(base_from_start, base_from_end))))
     steps = max(2, math.ceil(length_m / step_m), math.ceil(turn_rad / 0.1))
-    path = [np.asarray(near_joints_rad, dtype=np.float64)]
-    for fraction in np.linspace(0.0, 1.0, steps + 1):
-        joints = inverse(interpolate(base_from_start, base_from_end, float(fraction)), path[-1])
-        if joints is None or np.abs(joints - path[-1]).max() > _LARGEST_STEP_RAD:
-            raise UnreachableError(
-                f"the straight line to {goal} leaves the reach of the arm, passes a singularity or"
-                " would turn a joint beyond ±360°: make a joint move or go over another waypoint"
-            )
+    path, there = [np.asarray(near_joints_rad, dtype=np.float64)], 0.0
+    ahead = np.linspace(1.0, 0.0, steps + 1).tolist()
+    while ahead:
+        joints = inverse(interpolate(base_from_start, base_from_end, ahead[-1]), path[-1])
+        step_rad = math.inf if joints is None else float(np.abs(joints - path[-1]).max())
+        if joints is None or step_rad > _LARGEST_STEP_RAD:
+            raise _no_line(goal)
+        if step_rad > _FINE_STEP_RAD and ahead[-1] - there > _FINEST_FRACTION:
+            ahead.append((there + ahead[-1]) / 2)
+            continue
         path.append(joints)
+        there = ahead.pop()
+    if _through_straight_wrist(np.asarray(path[1:])):
+        raise _no_line(goal)
     return np.asarray(path[1:])
+
+
+def _no_line(goal: str) -> UnreachableError:
+    return UnreachableError(
+        f"the straight line to {goal} leaves the reach of the arm, passes a singularity or"
+        " would turn a joint beyond ±360°: make a joint move or go over another waypoint"
+    )
+
+
+def _through_straight_wrist(path: FloatArray) -> bool:
+    """Say whether joint 5 goes through 0° or 180°, where joints 4 and 6 may whirl between samples.
+
+    Of two postures the nearer one is taken for the next sample, which is the one that passes; a
+    controller that keeps to its own turns two joints by half a turn at that point.
+    """
+    bend = np.sin(path[:, 4])
+    return bool((bend < -_BENT).any() and (bend > _BENT).any())
 
 
 def turned_joints(start_rad: FloatArray, end_rad: FloatArray, step_rad: float = 0.05) -> FloatArray:

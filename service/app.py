@@ -96,6 +96,12 @@ def end_streams(app: FastAPI) -> None:
     context.bell.close()
 
 
+def end_motion(app: FastAPI) -> None:
+    """Have the scan under way end and none begin any more; returns when nothing moves."""
+    context: Context = app.state.context
+    context.rig.end()
+
+
 _page = APIRouter()
 
 

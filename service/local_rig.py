@@ -16,7 +16,7 @@ from canopy_skel.messages import Message
 from canopy_skel.recording.writer import publish
 from drivers.errors import DriverError, MoveRefusedError, NotAcknowledgedError
 from drivers.guarded_arm import Limits
-from drivers.protocols import Arm, Camera, ToolPose
+from drivers.protocols import Arm, ArmMode, Camera, ToolPose, raise_unless_movable
 from drivers.waypoints import after, moves_to
 from service.opened import Opened
 from service.rig import (
@@ -88,6 +88,14 @@ class RigParts:
     stage: Stage = lambda name: nullcontext()
 
 
+@dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class _Since:
+    """How often the arm was stopped, and the newest wish that a scan should not run."""
+
+    stops: int
+    called_off: object
+
+
 class LocalRig:
     """See `service.rig.Rig`. A context manager; leaving it stops the arm and the scan."""
 
@@ -97,7 +105,10 @@ class LocalRig:
         self._arm, self._camera = Opened(parts.arm), Opened(parts.camera)
         self._open = ExitStack()
         self._sessions: dict[str, tuple[ScanSpec, ScanSession]] = {}
+        self._launching = threading.Lock()  # held for a moment only, never while a driver is asked
+        self._called_off: dict[str, object] = {}
         self._stopped, self._stops = "", 0
+        self._ending = False
         self._listeners: list[Callable[[RigEvent], None]] = []
 
     def __enter__(self) -> "LocalRig":
@@ -112,13 +123,7 @@ class LocalRig:
 
     def __exit__(self, *reasons: object) -> None:
         """End a scan under way, keeping its recording, and close arm and camera."""
-        for scan_id in [*self._sessions]:
-            session = self._sessions[scan_id][1]
-            if session.status.state is ScanState.RUNNING:
-                try:
-                    self._interrupt(session, ScanState.PAUSED)
-                except RigNotReadyError as error:
-                    log.warning("scan %s: %s", scan_id, error)
+        self.end()
         self._open.close()
 
     def plan(self, spec: ScanSpec) -> list[WaypointVerdict]:
@@ -148,8 +153,8 @@ class LocalRig:
 
     def start(self, spec: ScanSpec, views_before: int = 0) -> ScanStatus:
         """Begin a scan; see `Rig.start`."""
+        since = self._since(spec.scan_id)
         with self._lock:
-            stops = self._stops
             self._require_free()
             self._require_ready()
             verdicts = self.plan(spec)
@@ -160,28 +165,28 @@ class LocalRig:
                     f" waypoint {bad[0].index}: {bad[0].reason}",
                     verdicts,
                 )
-            return self._launch(spec, stops, views_before)
+            return self._launch(spec, since, views_before)
 
     def pause(self, scan_id: str) -> ScanStatus:
-        """Stop the arm and keep the scan."""
-        _, session = self._session(scan_id)
+        """Stop the arm and keep the scan; a start that is under way comes to nothing."""
+        session = self._call_off(scan_id)
         self._interrupt(session, ScanState.PAUSED)
         return session.status
 
     def resume(self, scan_id: str) -> ScanStatus:
         """Go on at the first missing waypoint."""
+        since = self._since(scan_id)
         with self._lock:
-            stops = self._stops
             spec, session = self._session(scan_id)
             if session.status.state in FINISHED:
                 raise RigNotReadyError(f"scan {scan_id} is {session.status.state}; start a new one")
             self._require_free()
             self._require_ready()
-            return self._launch(spec, stops, session.status.views_done)
+            return self._launch(spec, since, session.status.views_done)
 
     def cancel(self, scan_id: str) -> ScanStatus:
         """Stop the arm and end the scan; what was recorded stays."""
-        _, session = self._session(scan_id)
+        session = self._call_off(scan_id)
         self._interrupt(session, ScanState.CANCELLED)
         session.conclude(ScanState.CANCELLED)
         return session.status
@@ -204,8 +209,26 @@ class LocalRig:
         self._stopped = self._stopped or reason
         self._stops += 1
 
+    def end_held(self) -> None:
+        """End a scan whose arm is held, and starts under way; see `Rig.end_held`.
+
+        A scan that waits for its camera meanwhile has not met the hold, and would never know of it.
+        """
+        try:
+            state = self._parts.arm.state()
+            raise_unless_movable(state, also=(ArmMode.MOVING, ArmMode.INTERRUPTED))
+        except DriverError as error:
+            with self._launching:
+                self._stops += 1
+                running = [session for _, session in self._sessions.values() if session.running]
+            for session in running:
+                session.give_up(error)
+            for session in running:
+                self._join(session, "the arm is held")
+
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again; a scan goes on only by `resume`."""
+        self.end_held()
         stops = self._stops
         try:
             self._arm.open()
@@ -215,6 +238,17 @@ class LocalRig:
         if self._stops == stops:  # a stop since then wants an acknowledgement of its own
             self._stopped = ""
         self._tell("", "acknowledged", {"reason": reason})
+
+    def end(self) -> None:
+        """Pause the scan under way and start none any more; see `Rig.end`."""
+        with self._launching:
+            self._ending = True
+            running = [session for _, session in self._sessions.values() if session.running]
+        for session in running:
+            try:
+                self._interrupt(session, ScanState.PAUSED)
+            except RigNotReadyError as error:
+                log.warning("a scan under way when the service ended: %s", error)
 
     def status(self, scan_id: str) -> ScanStatus:
         """Return the scan as it is."""
@@ -282,8 +316,21 @@ class LocalRig:
         """Tell the listeners of something that happened elsewhere, such as a new skeleton."""
         self._tell(scan_id, kind, fields)
 
-    def _launch(self, spec: ScanSpec, stops: int, views_before: int) -> ScanStatus:
-        """Start a session, unless the arm was stopped since `stops` was read.
+    def _since(self, scan_id: str) -> _Since:
+        """Return what a start must find unchanged in the end; read before anything is waited for.
+
+        The camera may take half a minute to be there: time enough to call the start off.
+        """
+        return _Since(stops=self._stops, called_off=self._called_off.get(scan_id))
+
+    def _call_off(self, scan_id: str) -> ScanSession:
+        """Have a start of this scan that is under way come to nothing; return its session."""
+        with self._launching:
+            self._called_off[scan_id] = object()
+            return self._session(scan_id)[1]
+
+    def _launch(self, spec: ScanSpec, since: _Since, views_before: int) -> ScanStatus:
+        """Start a session, unless the arm was stopped or the scan called off in the meantime.
 
         The session is there to be stopped before that is looked at: no stop falls in between.
         """
@@ -293,20 +340,33 @@ class LocalRig:
             session.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RigNotReadyError(f"disk: {_unwritable(session.path.parent, error)}") from error
-        self._sessions[spec.scan_id] = (spec, session)
-        try:
-            if self._stops != stops:
-                self._require_ready()
-                raise RigNotReadyError("arm: it was stopped meanwhile; look at it, then try again")
-            self._parts.feed.begin(spec, session.path)
-            session.start()
-        except Exception:
-            if before is None:
-                del self._sessions[spec.scan_id]
-            else:
-                self._sessions[spec.scan_id] = before
-            raise
+        with self._launching:
+            self._sessions[spec.scan_id] = (spec, session)
+            try:
+                self._require_unchanged(spec.scan_id, since)
+                self._parts.feed.begin(spec, session.path)
+                session.start()
+            except Exception:
+                if before is None:
+                    del self._sessions[spec.scan_id]
+                else:
+                    self._sessions[spec.scan_id] = before
+                raise
         return session.status
+
+    def _require_unchanged(self, scan_id: str, since: _Since) -> None:
+        if self._ending:
+            raise RigNotReadyError("the service is ending")
+        if self._called_off.get(scan_id) is not since.called_off:
+            raise RigNotReadyError(f"scan {scan_id} was paused or cancelled meanwhile")
+        if self._stops != since.stops:
+            held = self._hold() or "it was stopped meanwhile; look at it, then try again"
+            raise RigNotReadyError(f"arm: {held}")
+
+    def _hold(self) -> str:
+        """Return why nothing may move, whatever the arm says; nothing if it may."""
+        stopped = self._stopped
+        return stopped and f"{stopped}: look at the arm, then acknowledge with a reason"
 
     def _session_for(
         self, spec: ScanSpec, views_before: int, exposed_before: Mapping[int, int]
@@ -342,10 +402,13 @@ class LocalRig:
             session.interrupt(wanted)
         except DriverError as error:
             raise _not_ready(error) from error
+        self._join(session, "the arm was told to stop")
+
+    def _join(self, session: ScanSession, why: str) -> None:
         if not session.join(STOP_TIMEOUT_S):
             raise RigNotReadyError(
-                "the arm was told to stop but the scan has not ended within"
-                f" {STOP_TIMEOUT_S:.0f} s; look at the arm, then try again"
+                f"{why} but the scan has not ended within {STOP_TIMEOUT_S:.0f} s;"
+                " look at the arm, then try again"
             )
 
     def _session(self, scan_id: str) -> tuple[ScanSpec, ScanSession]:
@@ -369,9 +432,7 @@ class LocalRig:
                 raise RigNotReadyError(f"{part.name}: {part.detail}")
 
     def _arm_status(self) -> PartStatus:
-        detail = _trouble(self._arm)
-        if not detail and self._stopped:
-            detail = f"{self._stopped}: look at the arm, then acknowledge with a reason"
+        detail = _trouble(self._arm) or self._hold()
         return PartStatus(name="arm", ready=not detail, detail=detail)
 
     def _camera_status(self) -> PartStatus:

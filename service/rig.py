@@ -178,8 +178,26 @@ class Rig(Protocol):
         """Let nothing move until somebody has acknowledged; the reason is a short sentence."""
         ...
 
+    def end_held(self) -> None:
+        """End a scan whose arm is held as STOPPED, so that only a `resume` lets it go on.
+
+        Does nothing while nothing holds the arm. What `acknowledge` does first; who notes stops
+        calls it before, to have this one noted.
+
+        Raises:
+            RigNotReadyError: the scan has not ended in time; it will, and begins no motion.
+        """
+        ...
+
     def acknowledge(self, reason: str) -> None:
         """An operator has looked and says why moving is safe again. Raises RigNotReadyError."""
+        ...
+
+    def end(self) -> None:
+        """The service is ending: pause the scan under way, and start none any more.
+
+        Returns when nothing moves, or when that cannot be had.
+        """
         ...
 
     def status(self, scan_id: str) -> ScanStatus:

@@ -106,6 +106,7 @@ class ScanSession:
         self._recorded = recorded
         self._conclude_with = conclude_with
         self._wanted: ScanState | None = None
+        self._held: DriverError | None = None
         self._state = ScanState.RUNNING
         self._detail = ""
         self._done: set[int] = set()
@@ -151,17 +152,29 @@ class ScanSession:
         """Stop the arm at once and end the session as `wanted`.
 
         When this returns, the session begins no further motion. The first stop does not wait for
-        the lock, which is held while a move is being begun; the second is for that move. A session
-        that has ended moves nothing: the arm may be another's.
+        the lock, which is held while a move is being begun; the second is for that move, also where
+        the first has failed. A session that has ended moves nothing: the arm may be another's.
+
+        Raises:
+            DriverError: a stop was not confirmed.
         """
         if not self.running:
             return
         self._wanted = self._wanted or wanted
-        self._tools.arm.stop()
-        with self._lock:
-            under_way = self._state is ScanState.RUNNING
-        if under_way:
+        try:
             self._tools.arm.stop()
+        finally:
+            with self._lock:
+                under_way = self._state is ScanState.RUNNING
+            if under_way:
+                self._tools.arm.stop()
+
+    def give_up(self, held: DriverError) -> None:
+        """End the session with what holds the arm, which it need not have met itself.
+
+        It begins no further motion, also when the arm is let go; `join` tells when it has ended.
+        """
+        self._held = held
 
     def conclude(self, state: ScanState) -> None:
         """Set the state of a session that rests: an operator's decision. What is over stays so."""
@@ -279,6 +292,9 @@ class ScanSession:
             with stage("command"), self._lock:
                 self._check_wanted()
                 arm.start_move(move)
+                if self._wanted or self._held:  # a stop since then was too early, or has failed
+                    arm.stop()
+                    self._check_wanted()
             with stage("settle"):
                 timeout_s = SLOWED_DOWN * travel_s(state, move) + spec.settle_timeout_s
                 state = wait_settled(arm, timeout_s=timeout_s)
@@ -288,6 +304,7 @@ class ScanSession:
         reasons: list[str] = []
         for attempt in range(self._spec.retakes + 1):
             self._check_wanted()
+            raise_unless_movable(before, also=(ArmMode.INTERRUPTED,))
             with self._tools.stage("grab"):
                 image = self._tools.camera.grab(self._spec.grab_timeout_s)
             with self._tools.stage("gate"):
@@ -322,6 +339,8 @@ class ScanSession:
     def _check_wanted(self) -> None:
         if self._wanted is not None:
             raise ScanInterruptedError(f"{self._wanted} by the operator")
+        if self._held is not None:
+            raise self._held
 
     def _note(self, writer: RecordingWriter, kind: str, **fields: object) -> None:
         writer.write_event(time.time_ns(), {"kind": kind, **fields})

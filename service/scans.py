@@ -171,6 +171,7 @@ class Scans:
 
     def acknowledge(self, reason: str) -> None:
         """Let the arm move again, and forget the stops until now. Raises RigNotReadyError."""
+        self._rig.end_held()
         self._catch_up_journal()  # a stop that is noted later would count as one after this
         last = self.catalogue.last_stop()  # one during the acknowledgement wants its own
         self._rig.acknowledge(reason)

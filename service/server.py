@@ -1,5 +1,9 @@
-"""Serve an app until a signal; open event streams do not hold the end up."""
+"""Serve an app until a signal; the arm stands before the listener closes.
 
+Open event streams do not hold the end up.
+"""
+
+import asyncio
 import errno
 import logging
 import socket
@@ -9,9 +13,10 @@ import uvicorn
 from fastapi import FastAPI
 
 from canopy_skel.errors import UsageError
-from service.app import end_streams
+from service.app import end_motion, end_streams
 
 _BACK_STOP_S = 1
+_LOOK_S = 0.1
 _log = logging.getLogger("uvicorn.error")  # the one that uvicorn sets up
 
 
@@ -40,6 +45,16 @@ class Server(uvicorn.Server):
             self.force_exit = True
         self.should_exit = True
         end_streams(self._canopy)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End what moves while a stop is still answered; then the connections.
+
+        A second signal waits for neither.
+        """
+        ending = asyncio.create_task(asyncio.to_thread(end_motion, self._canopy))
+        while not (ending.done() or self.force_exit):
+            await asyncio.wait([ending], timeout=_LOOK_S)
+        await super().shutdown(sockets)
 
 
 def make_server(app: FastAPI, *, port: int = 8000, log_level: str = "info") -> Server:

@@ -84,6 +84,30 @@ def test_a_line_that_whirls_a_joint_is_refused():
         check(linear(past_the_column), state, Limits(**WIDE))
 
 
+def tilted(state, vector_rad):
+    target = state.pose.base_from_tool0.copy()
+    target[:3, :3] = target[:3, :3] @ kinematics.rotation_from_vector(np.array(vector_rad))
+    return target
+
+
+def test_a_turn_in_place_that_whirls_a_joint_is_refused():
+    """Near a straight wrist two joints turn much faster than the tool."""
+    state = standing(np.array([0.0, -1.5, 1.6, -1.6, 0.3, 0.0]))
+    move = linear(tilted(state, (0.5, 0.0, 0.0)), speed_mps=0.25)
+    check(move, state, Limits(**WIDE, joint_speed_rps=1.2))
+    with pytest.raises(SpeedCapError, match="a joint's speed on this line"):
+        check(move, state, Limits(**WIDE, joint_speed_rps=0.9))
+
+
+def test_a_turn_in_place_is_as_fast_as_its_number_says():
+    """Joint 6 turns alone."""
+    state = standing()
+    move = linear(tilted(state, (0.0, 0.0, 0.5)), speed_mps=0.2)
+    check(move, state, Limits(**WIDE, joint_speed_rps=0.201))
+    with pytest.raises(SpeedCapError, match=r"line, 0\.2 rad/s"):
+        check(move, state, Limits(**WIDE, joint_speed_rps=0.199))
+
+
 def test_the_box_holds_for_the_tool_all_along_a_joint_move():
     half_turn = np.add(HOME, [np.pi, 0, 0, 0, 0, 0])
     side = Limits(box_min_m=(-1.0, -0.4, -1.0), box_max_m=(1.0, 0.4, 1.0), joint_speed_rps=1.0)

@@ -84,3 +84,31 @@ def test_there_is_no_straight_path_through_the_column():
     assert kinematics.inverse(end, joints) is not None
     with pytest.raises(UnreachableError, match="straight line to"):
         kinematics.straight_joints(start, end, joints)
+
+
+def tilted_about(joints, axis, angle_rad):
+    pose = kinematics.forward(joints)
+    turn = kinematics.rotation_from_vector(angle_rad * np.asarray(axis))
+    pose[:3, :3] = pose[:3, :3] @ turn
+    return pose
+
+
+@pytest.mark.parametrize("beside_rad", [0.0, 1e-6, 1e-3])
+@pytest.mark.parametrize("shift_m", [0.0, 0.1])
+def test_there_is_no_straight_path_through_a_straight_wrist(beside_rad, shift_m):
+    """Not even where the samples lie to both sides of it."""
+    joints = np.array([0.2, -1.4, 1.6, -1.5, 0.3, 0.0])
+    end = tilted_about(joints, [-beside_rad, 1.0, 0.0], 0.55)
+    end[2, 3] += shift_m
+    assert kinematics.inverse(end, joints) is not None
+    with pytest.raises(UnreachableError, match="passes a singularity"):
+        kinematics.straight_joints(kinematics.forward(joints), end, joints)
+
+
+def test_a_straight_path_is_sampled_finely_where_joints_turn_fast():
+    joints = np.array([0.2, -1.4, 1.6, -1.5, 0.25, 0.0])
+    start, end = kinematics.forward(joints), tilted_about(joints, [1.0, 0.0, 0.0], 0.8)
+    path = kinematics.straight_joints(start, end, joints)
+    assert np.abs(np.diff(path, axis=0)).max() <= 0.1
+    places = [kinematics.forward(joints)[:3, 3] for joints in path]
+    np.testing.assert_allclose(places, np.tile(start[:3, 3], (len(path), 1)), atol=1e-9)

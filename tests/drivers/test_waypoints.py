@@ -1,11 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from contracts.arm import down, joint, linear
 
 from canopy_skel.geometry import invert
 from drivers import kinematics
+from drivers.errors import MoveRefusedError
 from drivers.guarded_arm import Limits
-from drivers.protocols import ArmMode, ArmState, JointMove, ToolPose
+from drivers.protocols import ArmMode, ArmState, JointMove, LinearMove, ToolPose
 from drivers.waypoints import READY_JOINTS_RAD, after, moves_to, travel_s
 from mock_hw.fake_ur.motion import JointWay, LineWay, Motion
 from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
@@ -108,6 +111,44 @@ def test_a_tool_that_only_turns_is_let_turn():
     )
     [move] = moves_to(STANDING, turned(0.5), limits, speed_mps=0.2, acceleration_mps2=0.5)
     assert move.speed_mps == 0.2
+
+
+def test_a_tool_that_turns_in_place_near_a_straight_wrist_whirls_no_joint():
+    limits = Limits(
+        box_min_m=(-1.5, -1.5, -1.5), box_max_m=(1.5, 1.5, 2.0), tool_points_in_tool0=TOOL
+    )
+    rng, lines = np.random.default_rng(0), 0
+    for _ in range(200):
+        joints = READY_JOINTS_RAD + rng.normal(0, 0.3, 6)
+        joints[4] = rng.choice([-1, 1]) * rng.uniform(0.1, 0.5)
+        start = kinematics.forward(joints)
+        state = replace(
+            STANDING, joints_rad=joints, pose=ToolPose(stamp_ns=0, base_from_tool0=start)
+        )
+        turn = rng.normal(size=3)
+        turn *= rng.uniform(0.3, 1.0) / np.linalg.norm(turn)
+        goal = start.copy()
+        goal[:3, :3] = start[:3, :3] @ kinematics.rotation_from_vector(turn)
+        try:
+            moves = moves_to(state, goal, limits, speed_mps=0.25, acceleration_mps2=0.5)
+        except MoveRefusedError:
+            continue
+        if isinstance(moves[0], LinearMove):
+            lines += 1
+            assert fastest_rps(state, moves[0]) <= 1.01 * limits.joint_speed_rps
+    assert lines > 10
+
+
+def fastest_rps(state, move):
+    """How fast a joint gets on a line, as the controller drives it."""
+    way = LineWay(state.pose.base_from_tool0, move.base_from_tool0, np.eye(4))
+    motion = Motion(way=way, speed=move.speed_mps, acceleration=move.acceleration_mps2)
+    joints, fastest = state.joints_rad, 0.0
+    while not motion.done:
+        motion.advance(0.008)
+        before, joints = joints, way.joints_at(motion.travelled, joints)
+        fastest = max(fastest, np.abs(joints - before).max() / 0.008)
+    return fastest
 
 
 @pytest.mark.parametrize(

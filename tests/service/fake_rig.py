@@ -129,6 +129,12 @@ class FakeRig:
     def hold(self, reason: str) -> None:
         self.holds.append(reason)
 
+    def end(self) -> None:
+        pass
+
+    def end_held(self) -> None:
+        pass
+
     def acknowledge(self, reason: str) -> None:
         if isinstance(self.refusal, RigNotReadyError):
             raise self.refusal

@@ -7,25 +7,30 @@ import re
 import socket
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+import httpx2
 import numpy as np
 import pytest
+from live_rig import waypoint
+from live_service import serving
 from scenes.wood import view_from
 
 from canopy_skel.geometry import invert
 from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import carry_over, messages_of_view, read_recording
 from drivers import kinematics
-from drivers.errors import CameraTimeoutError
-from drivers.guarded_arm import GuardedArm, Limits
+from drivers.errors import CameraTimeoutError, NotConnectedError
+from drivers.guarded_arm import GuardedArm, Limits, check
 from drivers.protocols import CameraImage
 from drivers.ur5.arm import Ur5Arm
 from drivers.ur5.dashboard import Dashboard
 from drivers.ur5.messages import Ur5Config
 from mock_hw.fake_ur.process import FakeUr, free_host
 from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
+from service.catalogue import Catalogue
 from service.local_rig import LocalRig, RigParts
 from service.rig import (
     PartStatus,
@@ -407,6 +412,167 @@ def test_a_stop_while_a_move_is_being_begun_keeps_it_from_beginning(rig, fake, m
     assert_stands_still(fake)
 
 
+class BlockedCamera:
+    """Lets the first picture wait, as while the camera's process is replaced."""
+
+    def __init__(self, camera):
+        self._grab, self.waiting, self.there = camera.grab, threading.Event(), threading.Event()
+        camera.grab = self.grab
+
+    def grab(self, timeout_s):
+        self.waiting.set()
+        assert self.there.wait(timeout_s)
+        return self._grab(timeout_s)
+
+
+def open_and_close_the_door(rig, fake):
+    fake.do("safeguard_stop")
+    while "safeguard" not in rig.parts()[0].detail:
+        time.sleep(0.01)
+    fake.do("close_safeguard")
+    while "not acknowledged" not in rig.parts()[0].detail:
+        time.sleep(0.01)
+
+
+def start_over_http(http, **changes):
+    poses = [waypoint(pose) for pose in WAYPOINTS[:4]]
+    body = {"tree_id": "t1", "waypoints": poses, "segmenter": "recorded", **changes}
+    answer = http.post("/v1/scans", json=body, headers={"Idempotency-Key": "k"})
+    assert answer.status_code == 202, answer.text
+    return answer.json()["scan_id"]
+
+
+def acknowledge(http):
+    return http.post("/v1/rig:acknowledge", json={"reason": "all out, way is clear"})
+
+
+def test_an_acknowledgement_alone_moves_nothing(rig, fake, camera, tmp_path):
+    """The door opens and closes again while a scan waits for its camera, and never meets it."""
+    blocked = BlockedCamera(camera)
+    with serving(tmp_path / "state", rig) as live:
+        scan_id = start_over_http(live.http)
+        assert blocked.waiting.wait(20.0)
+        open_and_close_the_door(rig, fake)
+        before = fake.do("state")["joints_rad"]
+        threading.Timer(0.3, blocked.there.set).start()
+        assert acknowledge(live.http).status_code == 200
+        status = wait_for(rig, scan_id, ScanState.STOPPED, ScanState.DONE)
+        assert (status.state, status.views_done) == (ScanState.STOPPED, 1)
+        assert "not acknowledged: safeguard stop" in status.detail
+        assert_stands_still(fake)
+        assert fake.do("state")["joints_rad"] == before
+        assert live.http.post(f"/v1/scans/{scan_id}:resume").status_code == 200
+        assert wait_for(rig, scan_id, ScanState.DONE, ScanState.STOPPED).state is ScanState.DONE
+    with Catalogue(tmp_path / "state") as catalogue:
+        assert catalogue.last_stop() == 0
+
+
+def test_an_acknowledgement_is_refused_until_the_scan_has_ended(rig, fake, camera, monkeypatch):
+    blocked = BlockedCamera(camera)
+    rig.start(spec())
+    assert blocked.waiting.wait(20.0)
+    open_and_close_the_door(rig, fake)
+    with monkeypatch.context() as patched:
+        patched.setattr("service.local_rig.STOP_TIMEOUT_S", 0.2)
+        with pytest.raises(RigNotReadyError, match="the scan has not ended within"):
+            rig.acknowledge("all out")
+    blocked.there.set()
+    assert wait_for(rig, "scan-1", ScanState.STOPPED).views_done == 1
+    assert_stands_still(fake)
+    rig.acknowledge("all out")
+    rig.resume("scan-1")
+    assert wait_for(rig, "scan-1", ScanState.DONE, ScanState.STOPPED).state is ScanState.DONE
+
+
+def test_no_picture_is_taken_again_while_the_arm_is_held(rig, fake, camera, monkeypatch):
+    grab = camera.grab
+
+    def meanwhile(timeout_s):
+        fake.do("safeguard_stop")
+        while rig.parts()[0].ready:
+            time.sleep(0.01)
+        return grab(timeout_s)
+
+    monkeypatch.setattr(camera, "grab", meanwhile)
+    camera.spoiled = 99
+    rig.start(spec())
+    assert "SafeguardStopError" in wait_for(rig, "scan-1", ScanState.STOPPED).detail
+    assert camera.grabs == 1
+
+
+def acknowledge_a_door(rig, fake):
+    open_and_close_the_door(rig, fake)
+    rig.acknowledge("all out, way is clear")
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "state", "why"),
+    [
+        (lambda rig, fake: rig.pause("scan-1"), ScanState.PAUSED, "was paused or cancelled"),
+        (lambda rig, fake: rig.cancel("scan-1"), ScanState.CANCELLED, "was paused or cancelled"),
+        (acknowledge_a_door, ScanState.PAUSED, "arm: it was stopped meanwhile"),
+    ],
+)
+def test_a_resume_that_waits_for_the_camera_can_be_called_off(
+    rig, fake, camera, meanwhile, state, why
+):
+    rig.start(spec())
+    while rig.status("scan-1").views_done < 1:
+        time.sleep(0.005)
+    rig.pause("scan-1")
+    waiting, there, refusals = threading.Event(), threading.Event(), []
+
+    def opening():
+        if threading.current_thread() is resuming:
+            waiting.set()
+            assert there.wait(5.0)
+
+    def resume():
+        with pytest.raises(RigNotReadyError) as refused:
+            rig.resume("scan-1")
+        refusals.append(str(refused.value))
+
+    camera.check = opening
+    resuming = threading.Thread(target=resume)
+    resuming.start()
+    assert waiting.wait(5.0)
+    meanwhile(rig, fake)
+    assert rig.status("scan-1").state is state
+    there.set()
+    resuming.join(5.0)
+    assert len(refusals) == 1
+    assert why in refusals[0]
+    assert rig.status("scan-1").state is state
+    assert_stands_still(fake)
+
+
+def test_a_stop_that_fails_while_a_move_is_being_begun_is_made_good(rig, fake, monkeypatch):
+    """The arm cannot be told in the one moment in which there is nothing to stop yet."""
+    beginning, unheard, stop = threading.Event(), threading.Event(), Ur5Arm.stop
+
+    def slowly(*arguments):
+        beginning.set()
+        assert unheard.wait(5.0)
+        check(*arguments)
+
+    def not_at_first(arm):
+        if not unheard.is_set():
+            unheard.set()
+            raise NotConnectedError("stop not confirmed: use the emergency stop")
+        stop(arm)
+
+    monkeypatch.setattr("drivers.guarded_arm.check", slowly)
+    monkeypatch.setattr(Ur5Arm, "stop", not_at_first)
+    before = fake.do("state")["joints_rad"]
+    rig.start(spec(speed_mps=0.005))
+    assert beginning.wait(5.0)
+    with pytest.raises(RigNotReadyError, match="use the emergency stop"):
+        rig.stop()
+    assert wait_for(rig, "scan-1", ScanState.STOPPED).views_done == 0
+    assert_stands_still(fake)
+    np.testing.assert_allclose(fake.do("state")["joints_rad"], before, atol=0.02)
+
+
 def test_a_scan_that_cannot_begin_leaves_the_rig_free(rig, tmp_path):
     (tmp_path / "scans").write_bytes(b"no folder")
     with pytest.raises(RigNotReadyError, match=r"disk: .*scan-1: cannot be written .* check the"):
@@ -664,3 +830,34 @@ def test_stop_from_another_thread_ends_motion_at_once(rig, fake):
     assert not stopper.is_alive()
     wait_for(rig, "scan-1", ScanState.STOPPED)
     assert_stands_still(fake)
+
+
+def test_the_arm_stands_before_the_service_stops_answering(rig, fake, camera, tmp_path):
+    """Its camera keeps the scan from ending for a while; the service can be asked all along."""
+    blocked, service = BlockedCamera(camera), ExitStack()
+    live = service.enter_context(serving(tmp_path / "state", rig))
+    scan_id = start_over_http(live.http)
+    assert blocked.waiting.wait(20.0)
+    ending = threading.Thread(target=service.close)
+    ending.start()
+    time.sleep(0.5)
+    assert httpx2.post(f"{live.url}/v1/rig:stop").status_code == 200
+    blocked.there.set()
+    ending.join(10.0)
+    assert not ending.is_alive()
+    assert rig.status(scan_id).state is ScanState.PAUSED
+    with Catalogue(tmp_path / "state") as catalogue:
+        assert catalogue.scan(scan_id).state is ScanState.PAUSED
+    with pytest.raises(httpx2.ConnectError):
+        httpx2.post(f"{live.url}/v1/rig:stop")
+
+
+def test_a_service_that_ends_stops_the_arm_itself(rig, fake, tmp_path):
+    """The server has ended, arm and camera are open still: nothing else has stopped the arm."""
+    with serving(tmp_path / "state", rig) as live:
+        scan_id = start_over_http(live.http, speed_mps=0.005)
+        wait_until_moving(rig, fake)
+    assert rig.status(scan_id).state is ScanState.PAUSED
+    assert_stands_still(fake)
+    with pytest.raises(RigNotReadyError, match="the service is ending"):
+        rig.resume(scan_id)
