@@ -12,12 +12,16 @@ from canopy_skel.kernels import trunks
 from canopy_skel.outlines import BARK, OUTLINE, THINNEST_M, Outlines
 
 _CELL_M = 0.015
-_MIN_COSINE, _ALONG_M, _ACROSS_M = 0.85, 0.05, 0.11
-_LEAST_POINTS, _MOST_POINTS, _MOST_LINES, _COUNTS_AS = 40, 96, 64, 20.0
-_BARK_M, _OUTLINE_M, _SPREAD, _EXPECTED, _SECOND_START = 0.006, 0.004, 0.5, 1.1, 1.7
-_REACH_M = 0.13
+"""One place is tried in each such cell: strips run askew, and some lead where others do not."""
+_MIN_COSINE, _ALONG_M, _ACROSS_M, _REACH_M = 0.85, 0.05, 0.11, 0.13
+_LEAST_POINTS, _MOST_POINTS, _MOST_LINES = 40, 96, 64
+_COUNTS_AS = 20.0
+"""However many points there are, of bark and of outlines: neighbours err alike."""
+_BARK_M, _OUTLINE_M = 0.006, 0.004
+_SPREAD, _EXPECTED, _SECOND_START = 0.5, 1.1, 1.7
 _THICK_M, _THICKEST_M, _TIMES_THICKER, _TIMES_PIECES = 0.018, 0.1, 1.2, 1.7
 _DEVIATION, _ON_BARK, _ON_OUTLINES, _THROUGH = 0.1, 0.9, 0.4, 0.2
+"""Of the radius at most; shares of the bark and of the outlines on it at least; through it."""
 _LIMITS = np.array(
     [
         _MIN_COSINE,
