@@ -40,7 +40,7 @@ demo-replay: $(RUNS)
 SIDE_BY_SIDE := tests/canopy_skel tests/mock_hw/orchard tests/mock_hw/test_motion.py \
 	tests/service/training \
 	$(patsubst %,tests/service/test_%.py,adopt ahead batch calibrate catalogue cli cli_simulate \
-		experiment kernels pixelfit recordings segment segmenter_choice sources training) \
+		experiment kernels lone_views pixelfit recordings segment segmenter_choice sources training) \
 	$(patsubst %,tests/drivers/test_%.py,clock guarded_arm hand_eye kinematics stereo waypoints)
 
 test: $(READY)

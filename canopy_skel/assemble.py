@@ -13,7 +13,7 @@ from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import Candidates, Parts, Places, candidates_of, links_to_make, places_on
-from canopy_skel.poses import PoseCorrection
+from canopy_skel.poses import LoneView, PoseCorrection
 
 TAIL_CONFIDENCE = 0.1
 """Of joins that no evidence supports, made only because one tree was asked for."""
@@ -22,11 +22,12 @@ OBSERVED, FRAGMENT, LINK, EXTENSION = range(4)
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Assembled:
-    """The skeleton, in how many parts wood was observed, and the views that were moved."""
+    """The skeleton, in how many parts wood was observed, views that were moved, or stand alone."""
 
     graph: SkeletonGraph
     observed_components: int
     corrections: tuple[PoseCorrection, ...]
+    lone_views: tuple[LoneView, ...]
 
 
 def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> Assembled:
@@ -56,6 +57,7 @@ def skeleton_of(scan: CanopyScan, likelihood: LikelihoodMap, models: Models) -> 
         graph=graph,
         observed_components=int(parts.component.max(initial=-1)) + 1,
         corrections=tuple(corrections),
+        lone_views=tuple(scan.lone_views()),
     )
 
 

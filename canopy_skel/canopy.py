@@ -24,7 +24,14 @@ from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
 from canopy_skel.observe import Observation, observe
 from canopy_skel.pieces import PieceConfig
-from canopy_skel.poses import PoseConfig, PoseCorrection, corrected, pose_corrections
+from canopy_skel.poses import (
+    LoneView,
+    PoseConfig,
+    PoseCorrection,
+    corrected,
+    lone_views,
+    pose_corrections,
+)
 from canopy_skel.segment import BranchMask
 from canopy_skel.slivers import inside_thicker, on_axis
 from canopy_skel.trunks import onto_trunks
@@ -32,6 +39,8 @@ from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
 POINT_FEATURES = 27
+_ALONG_INSTANCES = 1
+"""The column of what views agree on, see `kernels.agree`."""
 NO_MAP_NATS = 12.0
 """-log p where the likelihood map says nothing."""
 
@@ -172,6 +181,17 @@ class CanopyScan:
             seen = replace(seen, points_in_base=corrected(seen, corrections))
             fused = fuse(seen, self.config.fusion)
         return fused, corrections
+
+    def lone_views(self) -> list[LoneView]:
+        """Return the views that hardly any other agrees with."""
+        order = sorted(self._seen)
+        of_masks = [~self._seen[index].fragment for index in order]
+        points = np.array([np.count_nonzero(chosen) for chosen in of_masks], dtype=np.int64)
+        along = [
+            np.count_nonzero(self._agreed[index][chosen, _ALONG_INSTANCES])
+            for index, chosen in zip(order, of_masks, strict=True)
+        ]
+        return lone_views(np.array(along) / np.maximum(points, 1), points)
 
     def parts(self, observed: Observed, models: Models) -> tuple[Parts, Observed]:
         """Return what is to be joined, without specks, and the forest in the same numbers."""

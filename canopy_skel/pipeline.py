@@ -22,7 +22,7 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
-from canopy_skel.poses import PoseCorrection
+from canopy_skel.poses import LoneView, PoseCorrection
 from canopy_skel.segment import Segmenter
 from canopy_skel.segmenters.mapping import WithMaps
 from canopy_skel.segmenters.recorded import RecordedSegmenter
@@ -76,7 +76,7 @@ class Extraction:
     """A skeleton and what its making came across: map size in voxels, joins of Algorithm 1.
 
     preview: the joins are those of a spanning tree instead.
-    corrections: of views whose poses were off (method `canopy`).
+    corrections: of views whose poses were off; lone_views: too far for that (method `canopy`).
     """
 
     graph: SkeletonGraph
@@ -85,6 +85,7 @@ class Extraction:
     joins: tuple[Join, ...]
     preview: bool = False
     corrections: tuple[PoseCorrection, ...] = ()
+    lone_views: tuple[LoneView, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -352,4 +353,5 @@ class Skeletonizer:
             observed_components=joined.observed_components,
             joins=(),
             corrections=joined.corrections,
+            lone_views=joined.lone_views,
         )

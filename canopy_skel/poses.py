@@ -10,6 +10,7 @@ from canopy_skel.geometry import FloatArray, IntArray, transform_from, transform
 from canopy_skel.kernels import aligning, fuse
 
 _MIN_COSINE = 0.9
+_FEWEST_VIEWS, _FEWEST_POINTS, _ALONE = 3, 100, 0.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,6 +41,32 @@ class PoseCorrection:
     moved: FloatArray
     before_m: float
     after_m: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LoneView:
+    """A view that hardly any other agrees with: its place among those that are in.
+
+    along: share of its instances' wood along which others show any. usual: the median of all views.
+    """
+
+    view: int
+    along: float
+    usual: float
+
+
+def lone_views(along: FloatArray, points: IntArray) -> list[LoneView]:
+    """Return the views that are probably centimetres off, too far to be aligned with the others.
+
+    Beyond some 25 mm the wood of such a view is a forest of its own, which it fits perfectly.
+    along, points: (V,), see `LoneView`, and of how many points that is the share.
+    """
+    enough = points >= _FEWEST_POINTS
+    if np.count_nonzero(enough) < _FEWEST_VIEWS:
+        return []
+    usual = float(np.median(along[enough]))
+    alone = np.flatnonzero(enough & (along < _ALONE * usual))
+    return [LoneView(view=i, along=float(along[i]), usual=usual) for i in alone.tolist()]
 
 
 def pose_corrections(

@@ -98,7 +98,7 @@ def replay(
         contents = _files(path.stem, document, walk, request)
     summary = _summary(recording, document, walk, extraction, stopwatch)
     contents[_summary_name(path.stem)] = json.dumps(summary, indent=2).encode() + b"\n"
-    warnings = list(recording.warnings)
+    warnings = [*recording.warnings, *_doubts(path, walk.skeletonizer, extraction)]
     if not document.branches:
         reasons = Counter(instance.reason for instance in walk.skeletonizer.rejected)
         why = ", ".join(f"{count} x {reason}" for reason, count in reasons.most_common())
@@ -196,6 +196,16 @@ def _add(walk: _Walk, view: View | RejectedView, stopwatch: Stopwatch) -> None:
         return
     if pieces > walk.most_pieces:
         walk.picture, walk.most_pieces = view, pieces
+
+
+def _doubts(path: Path, skeletonizer: Skeletonizer, extraction: Extraction) -> list[str]:
+    """Return which views are probably centimetres off."""
+    return [
+        f"{path.name}: view {skeletonizer.views[one.view]}: only {one.along:.0%} of its wood lies"
+        f" along that of other views (usually {one.usual:.0%}): its pose is centimetres off, or the"
+        " tree moved; the skeleton has it twice, so record it anew"
+        for one in extraction.lone_views
+    ]
 
 
 def _files(
