@@ -23,11 +23,11 @@ def shifted(view, by_m):
     return replace(view, base_from_camera=base_from_camera)
 
 
-@pytest.mark.parametrize(("by_m", "alone"), [(0.0, []), (0.04, [2])])
+@pytest.mark.parametrize(("by_m", "alone"), [(0.0, []), (0.04, [3])])
 def test_a_view_that_is_centimetres_off_is_named(views, by_m, alone):
     maker = Skeletonizer(RecordedSegmenter(), MethodConfig(name="canopy"))
     for view in views:
-        maker.add_view(shifted(view, [0, by_m, 0]) if view.index == 2 else view)
+        maker.add_view(shifted(view, [0, by_m, 0]) if view.index == 3 else view)
     lone_views = maker.skeleton().lone_views
     assert [maker.views[one.view] for one in lone_views] == alone
 
@@ -36,7 +36,7 @@ def test_a_replay_says_so(views, tmp_path):
     path = tmp_path / "moved.mcap"
     with RecordingWriter(path, {"scan_id": "moved"}) as writer:
         for view in views:
-            writer.write_view(shifted(view, [0, 0.04, 0]) if view.index == 2 else view)
+            writer.write_view(shifted(view, [0, 0.04, 0]) if view.index == 3 else view)
     request = ReplayRequest(
         config=MethodConfig(name="canopy"),
         segmenter="recorded",
@@ -44,6 +44,6 @@ def test_a_replay_says_so(views, tmp_path):
         topics=None,
         memory_limit_bytes=1 << 32,
     )
-    [warning] = replay(path, tmp_path / "out", request, lambda done, total: None).warnings
-    assert "view 2" in warning
+    [warning] = replay(path, tmp_path, request, lambda done, total: None).warnings
+    assert "view 3" in warning
     assert "centimetres off" in warning
