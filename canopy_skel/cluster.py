@@ -13,6 +13,8 @@ from canopy_skel.kernels import parts, trust
 from canopy_skel.kernels import strip as outline
 from canopy_skel.segment import BranchMask
 
+THICKEST_M = 0.15
+"""Radius of wood. What is thicker is a false mask, and would take up the likelihood map."""
 FARTHEST_M = 3.0
 """From the camera. An arm works within a metre or two of it; the next row begins behind that."""
 
@@ -29,8 +31,8 @@ class ClusterConfig:
     `tolerance_m` from it in depth is cut; beyond 1.25 m the tolerance grows with the square of the
     distance, as stereo noise does. Where less than `min_trusted_share` of the mask's pixels are
     left, the profile is as likely the background's. What does not touch in cells of `connect_m` is
-    split; parts under `min_points` are dropped, and those whose second principal deviation exceeds
-    `max_flatness` of the first: blobs are not branches.
+    split; parts under `min_points` are dropped, those whose second principal deviation exceeds
+    `max_flatness` of the first (blobs are not branches), and those thicker than `THICKEST_M`.
     """
 
     erosion_px: int = 1
@@ -140,6 +142,7 @@ def cluster_branches(
     slender = _slender_parts(trusted, config)
     in_base = transform_points(view.base_from_camera, slender.points_in_camera)
     clusters, rejected = [], []
+    depth_m = slender.depth_m.tolist()
     for i, mask in enumerate(masks):
         reasons = [] if trusted.enough[i] else ["too few points with trusted depth"]
         strip = np.empty(5)
@@ -153,15 +156,15 @@ def cluster_branches(
                 reasons.append("not slender")
             elif strip[0] > view.intrinsics.fx_px:  # Nobody can say how thick that is.
                 reasons.append("wider than 90 degrees")
+            elif (half_m := half_width_m(strip, mask, depth_m[part], view.intrinsics)) > THICKEST_M:
+                reasons.append("thicker than a branch")
             else:
                 clusters.append(
                     BranchCluster(
                         view_index=view.index,
                         instance=mask.instance,
                         confidence=mask.confidence,
-                        half_width_m=half_width_m(
-                            strip, mask, float(slender.depth_m[part]), view.intrinsics
-                        ),
+                        half_width_m=half_m,
                         camera_in_base=view.base_from_camera[:3, 3],
                         points_in_base=in_base[first:end],
                     )

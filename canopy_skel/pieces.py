@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canopy_skel.cluster import FARTHEST_M, require_range
+from canopy_skel.cluster import FARTHEST_M, THICKEST_M, require_range
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
@@ -42,7 +42,7 @@ class PieceConfig:
     farthest_m: float = FARTHEST_M
     tolerance_m: float = 0.012
     min_valid_share: float = 0.15
-    thickest_m: float = 0.15
+    thickest_m: float = THICKEST_M
     thickest_fragment_m: float = 0.04
     centre_shift: float = np.pi / 4
     way_px: float = 60.0

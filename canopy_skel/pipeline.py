@@ -170,7 +170,8 @@ class Skeletonizer:
 
         Raises:
             ViewError: the view cannot be used; nothing has changed.
-            UsageError: the map would not fit into memory; nothing has changed.
+            UsageError: with it the map would not fit into memory; nothing has changed, and other
+                views may fit.
         """
         if view.index in self._known:
             return self._known[view.index].shown

@@ -185,6 +185,14 @@ def test_what_fills_more_than_90_degrees_of_view_has_no_thickness():
     assert [r.reason for r in rejected] == ["wider than 90 degrees"]
 
 
+def test_what_is_thicker_than_a_branch_is_none():
+    depth_m, instances = np.full((200, 320), 2.9), np.zeros((200, 320))
+    instances[70:130, 10:310] = 1
+    clusters, rejected = clusters_of(depth_m, instances)
+    assert clusters == []
+    assert [r.reason for r in rejected] == ["thicker than a branch"]
+
+
 @pytest.mark.parametrize("config", [ClusterConfig, PieceConfig])
 @pytest.mark.parametrize("nearest_m", [0.0, -1.0, np.nan, 3.0])
 def test_a_range_of_depth_begins_beyond_no_depth(config, nearest_m):
