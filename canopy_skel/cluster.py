@@ -129,13 +129,11 @@ def cluster_branches(
     """Lift the masks of a view into base.
 
     Raises:
-        ViewError: the view has no depth, or a mask reaches out of it.
+        ViewError: the view has no depth.
     """
     if view.depth_m is None:
         raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
     masks = list(masks)
-    for mask in masks:
-        _check_box(view, mask)
     if not masks:
         return [], []
     trusted = _trusted_points(view, view.depth_m, masks, config)
@@ -174,17 +172,6 @@ def cluster_branches(
             for reason in reasons
         ]
     return clusters, rejected
-
-
-def _check_box(view: View, mask: BranchMask) -> None:
-    height, width = view.color_rgb.shape[:2]
-    right, bottom = mask.left_px + mask.mask.shape[1], mask.top_px + mask.mask.shape[0]
-    if min(mask.left_px, mask.top_px) < 0 or right > width or bottom > height:
-        raise ViewError(
-            f"view {view.index}: the mask of instance {mask.instance} covers columns"
-            f" {mask.left_px} to {right} and rows {mask.top_px} to {bottom} of a picture of"
-            f" {width}x{height}; its segmenter must cut it off at the border"
-        )
 
 
 def _trusted_points(

@@ -12,7 +12,6 @@ from canopy_skel.frame import Intrinsics, View
 from canopy_skel.kernels.parts import parts_of, shapes_of
 from canopy_skel.kernels.strip import measure
 from canopy_skel.pieces import PieceConfig
-from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
 LENS = Intrinsics(fx_px=400, fy_px=400, cx_px=160, cy_px=100, width_px=320, height_px=200)
@@ -260,15 +259,6 @@ def test_a_thin_mask_is_not_eroded_away():
     instances[99:101, 60:260] = 1
     (cluster,), _ = clusters_of(depth_m, instances)
     assert len(cluster.points_in_base) == 2 * 200
-
-
-def test_a_mask_outside_the_picture_is_refused():
-    view = view_with(*stick())
-    masks = [
-        BranchMask(instance=7, left_px=300, top_px=5, mask=np.ones((4, 30), bool), confidence=0.5)
-    ]
-    with pytest.raises(ViewError, match=r"instance 7 covers columns 300 to 330"):
-        cluster_branches(view, masks, CONFIG)
 
 
 def test_no_masks_give_no_clusters():

@@ -9,6 +9,7 @@ from canopy_skel.frame import View
 from canopy_skel.likelihood import LikelihoodConfig
 from canopy_skel.pipeline import JOINERS, METHODS, MethodConfig, Skeletonizer
 from canopy_skel.recording import read_recording
+from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from drivers.stereo import with_depth
 
@@ -208,6 +209,38 @@ def test_a_view_from_far_away_is_refused_before_it_stretches_the_map(views):
     with pytest.raises(ViewError, match=r"view 1: its camera is at .* check its pose on /tf"):
         maker.add_view(view_from(1, base_from_camera=far))
     assert maker.views == (0,)
+
+
+class Fixed:
+    """A segmenter that finds one branch, the same in every view."""
+
+    def __init__(self, **wrong):
+        mask = {"left_px": 5, "top_px": 5, "mask": np.ones((4, 30), np.bool_), "confidence": 0.9}
+        self.masks = [BranchMask(instance=7, **(mask | wrong))]
+
+    def segment(self, view):
+        return self.masks
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"left_px": 300}, "covers columns 300 to 330"),
+        ({"top_px": 237}, "rows 237 to 241 of a picture of 320x240"),
+        ({"left_px": -1}, "covers columns -1 to 29"),
+        ({"mask": np.ones((4, 30), np.uint8)}, "is 2-D uint8"),
+        ({"mask": np.ones(30, np.bool_)}, "is 1-D bool"),
+        ({"confidence": np.nan}, "has a confidence of nan"),
+        ({"confidence": 1.5}, "has a confidence of 1.5"),
+        ({"confidence": -0.1}, "has a confidence of -0.1"),
+    ],
+)
+def test_a_mask_that_cannot_be_costs_the_view(views, wrong, says, name):
+    maker = Skeletonizer(Fixed(**wrong), MethodConfig(name=name))
+    with pytest.raises(ViewError, match=f"view 0: the mask of instance 7 .*{says}"):
+        maker.add_view(views[0])
+    assert maker.views == ()
 
 
 def test_a_mask_without_confidence_counts_for_nothing(views):
