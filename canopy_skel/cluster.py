@@ -47,8 +47,10 @@ class ClusterConfig:
     max_flatness: float = 0.55
 
     def __post_init__(self) -> None:
-        """Refuse a range of depth that is none."""
+        """Refuse ranges that are none."""
         require_range(self.nearest_m, self.farthest_m)
+        require_above_0("tolerance_m", self.tolerance_m)
+        require_above_0("connect_m", self.connect_m)
 
 
 def require_range(nearest_m: float, farthest_m: float) -> None:
@@ -62,6 +64,16 @@ def require_range(nearest_m: float, farthest_m: float) -> None:
             f"depth from {nearest_m} m to {farthest_m} m: give a nearest above 0 (no depth) and"
             " below the farthest"
         )
+
+
+def require_above_0(name: str, length_m: float) -> None:
+    """Check a length that is divided by.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not length_m > 0.0:
+        raise UsageError(f"{name} {length_m} m: give a length above 0")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

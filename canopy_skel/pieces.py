@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canopy_skel.cluster import FARTHEST_M, THICKEST_M, require_range
+from canopy_skel.cluster import FARTHEST_M, THICKEST_M, require_above_0, require_range
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
@@ -48,8 +48,9 @@ class PieceConfig:
     way_px: float = 60.0
 
     def __post_init__(self) -> None:
-        """Refuse a range of depth that is none, and knots for which kernels have no room."""
+        """Refuse ranges that are none, and knots for which kernels have no room."""
         require_range(self.nearest_m, self.farthest_m)
+        require_above_0("tolerance_m", self.tolerance_m)
         if not 2 <= self.fragment_knots <= _MOST_KNOTS or self.knot_px <= 0:
             raise UsageError(
                 f"{self.fragment_knots} knots for a fragment, one every {self.knot_px} px: give"
