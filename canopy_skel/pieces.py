@@ -19,6 +19,8 @@ from canopy_skel.spline import BranchSpline
 
 SAID = 5
 """Figures that a network says of a region, see `Regions`."""
+_LEAST_DISPARITY = 0.05
+"""Per metre, or that of twice the farthest depth: a line that runs on to less is no wood's."""
 _MOST_KNOTS = 8
 """As in `kernels.profile`, which must not be compiled for settings."""
 
@@ -128,6 +130,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         config.fragment_knots if fragments else profile.MAX_KNOTS,
         config.tolerance_m,
         config.min_valid_share,
+        min(_LEAST_DISPARITY, 0.5 / config.farthest_m),
     )
     kept, radius_m, points = _lifted(view, counts, knots, quality, config, fragments=fragments)
     return [
