@@ -119,7 +119,7 @@ def found_in(segmenter, color_rgb):
     from canopy_skel.frame import Intrinsics, View
 
     height, width = color_rgb.shape[:2]
-    lens = Intrinsics(fx_px=1, fy_px=1, cx_px=0, cy_px=0, width_px=width, height_px=height)
+    lens = Intrinsics(fx_px=width, fy_px=width, cx_px=0, cy_px=0, width_px=width, height_px=height)
     pose = np.eye(4)
     return segmenter.segment(
         View(index=0, stamp_ns=0, color_rgb=color_rgb, intrinsics=lens, base_from_camera=pose)

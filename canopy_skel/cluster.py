@@ -13,6 +13,8 @@ from canopy_skel.kernels import parts, trust
 from canopy_skel.kernels import strip as outline
 from canopy_skel.segment import BranchMask
 
+THICKEST_M = 0.15
+"""Radius of wood. What is thicker is a false mask, and would take up the likelihood map."""
 FARTHEST_M = 3.0
 """From the camera. An arm works within a metre or two of it; the next row begins behind that."""
 
@@ -29,8 +31,8 @@ class ClusterConfig:
     `tolerance_m` from it in depth is cut; beyond 1.25 m the tolerance grows with the square of the
     distance, as stereo noise does. Where less than `min_trusted_share` of the mask's pixels are
     left, the profile is as likely the background's. What does not touch in cells of `connect_m` is
-    split; parts under `min_points` are dropped, and those whose second principal deviation exceeds
-    `max_flatness` of the first: blobs are not branches.
+    split; parts under `min_points` are dropped, those whose second principal deviation exceeds
+    `max_flatness` of the first (blobs are not branches), and those thicker than `THICKEST_M`.
     """
 
     erosion_px: int = 1
@@ -45,8 +47,10 @@ class ClusterConfig:
     max_flatness: float = 0.55
 
     def __post_init__(self) -> None:
-        """Refuse a range of depth that is none."""
+        """Refuse ranges that are none."""
         require_range(self.nearest_m, self.farthest_m)
+        require_above_0("tolerance_m", self.tolerance_m)
+        require_above_0("connect_m", self.connect_m)
 
 
 def require_range(nearest_m: float, farthest_m: float) -> None:
@@ -60,6 +64,16 @@ def require_range(nearest_m: float, farthest_m: float) -> None:
             f"depth from {nearest_m} m to {farthest_m} m: give a nearest above 0 (no depth) and"
             " below the farthest"
         )
+
+
+def require_above_0(name: str, length_m: float) -> None:
+    """Check a length that is divided by.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not length_m > 0.0:
+        raise UsageError(f"{name} {length_m} m: give a length above 0")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -127,19 +141,18 @@ def cluster_branches(
     """Lift the masks of a view into base.
 
     Raises:
-        ViewError: the view has no depth, or a mask reaches out of it.
+        ViewError: the view has no depth.
     """
     if view.depth_m is None:
         raise ViewError(f"view {view.index}: no depth; compute it from the stereo pair first")
     masks = list(masks)
-    for mask in masks:
-        _check_box(view, mask)
     if not masks:
         return [], []
     trusted = _trusted_points(view, view.depth_m, masks, config)
     slender = _slender_parts(trusted, config)
     in_base = transform_points(view.base_from_camera, slender.points_in_camera)
     clusters, rejected = [], []
+    depth_m = slender.depth_m.tolist()
     for i, mask in enumerate(masks):
         reasons = [] if trusted.enough[i] else ["too few points with trusted depth"]
         strip = np.empty(5)
@@ -153,15 +166,15 @@ def cluster_branches(
                 reasons.append("not slender")
             elif strip[0] > view.intrinsics.fx_px:  # Nobody can say how thick that is.
                 reasons.append("wider than 90 degrees")
+            elif (half_m := half_width_m(strip, mask, depth_m[part], view.intrinsics)) > THICKEST_M:
+                reasons.append("thicker than a branch")
             else:
                 clusters.append(
                     BranchCluster(
                         view_index=view.index,
                         instance=mask.instance,
                         confidence=mask.confidence,
-                        half_width_m=half_width_m(
-                            strip, mask, float(slender.depth_m[part]), view.intrinsics
-                        ),
+                        half_width_m=half_m,
                         camera_in_base=view.base_from_camera[:3, 3],
                         points_in_base=in_base[first:end],
                     )
@@ -171,17 +184,6 @@ def cluster_branches(
             for reason in reasons
         ]
     return clusters, rejected
-
-
-def _check_box(view: View, mask: BranchMask) -> None:
-    height, width = view.color_rgb.shape[:2]
-    right, bottom = mask.left_px + mask.mask.shape[1], mask.top_px + mask.mask.shape[0]
-    if min(mask.left_px, mask.top_px) < 0 or right > width or bottom > height:
-        raise ViewError(
-            f"view {view.index}: the mask of instance {mask.instance} covers columns"
-            f" {mask.left_px} to {right} and rows {mask.top_px} to {bottom} of a picture of"
-            f" {width}x{height}; its segmenter must cut it off at the border"
-        )
 
 
 def _trusted_points(

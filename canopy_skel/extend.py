@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from canopy_skel.errors import UsageError
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, is_empty
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.links import Cost, Evidence, Parts
@@ -24,6 +25,14 @@ class ExtensionConfig:
     min_fragment_probability: float = 0.8
     clear_m: float = 0.012
 
+    def __post_init__(self) -> None:
+        """Refuse steps that lead nowhere, and a reach without end."""
+        if not (self.step_m > 0 and 0 <= self.reach_m < np.inf):
+            raise UsageError(
+                f"extensions in steps of step_m {self.step_m} m up to reach_m {self.reach_m} m:"
+                " give a step above 0, such as 0.005, and a reach from 0 (none) on"
+            )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Rays:
@@ -42,8 +51,10 @@ class Rays:
 def rays_of(
     parts: Parts, chosen: IntArray, evidence: Evidence, cost: Cost, config: ExtensionConfig
 ) -> Rays:
-    """Look ahead of the chosen ends (K,)."""
+    """Look ahead of the chosen ends (K,); of none where not even a step is within reach."""
     ends, steps = parts.ends, round(config.reach_m / config.step_m)
+    if steps == 0:
+        chosen, steps = chosen[:0], 1
     start = ends.vertex[chosen]
     length = config.step_m * np.arange(1, steps + 1)
     points = parts.points[start][:, None] + length[None, :, None] * ends.tangents[chosen][:, None]

@@ -12,6 +12,11 @@ UInt8Array = NDArray[np.uint8]
 UInt16Array = NDArray[np.uint16]
 Float32Array = NDArray[np.float32]
 
+LONGEST_SIDE = 10.0
+"""Of a picture, in focal lengths: a field of view of 157 degrees."""
+LONGEST_FOCUS = 100.0
+"""Focal length in longer sides of the picture: a field of view of half a degree."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Intrinsics:
@@ -23,6 +28,26 @@ class Intrinsics:
     cy_px: float
     width_px: int
     height_px: int
+
+    def flaw(self) -> str | None:
+        """Say why no pinhole camera is like that; None if one can be.
+
+        Points of a picture lifted by such numbers lie where no arithmetic reaches.
+        """
+        f, c = (self.fx_px, self.fy_px), (self.cx_px, self.cy_px)
+        size = (self.width_px, self.height_px)
+        side = max(size)
+        if not all(side / LONGEST_SIDE <= one <= side * LONGEST_FOCUS for one in f):
+            return (
+                f"fx = {f[0]:g}, fy = {f[1]:g} px is no focal length of a picture of"
+                f" {size[0]}x{size[1]}: {side / LONGEST_SIDE:g} to {side * LONGEST_FOCUS:g} is"
+            )
+        if not all(-side <= one <= most + side for one, most in zip(c, size, strict=True)):
+            return (
+                f"cx = {c[0]:g}, cy = {c[1]:g} px is more than a picture of {size[0]}x{size[1]}"
+                " outside of it"
+            )
+        return None
 
     def back_project(self, u_px: FloatArray, v_px: FloatArray, depth_m: FloatArray) -> FloatArray:
         """Return (N, 3) points in the camera frame for N pixel centres and their z depth."""
@@ -64,7 +89,8 @@ class View:
     i at scores[i - 1]; both None where nobody segmented the view.
 
     Raises:
-        ViewError: shapes disagree, or the pose is not a rigid transform.
+        ViewError: shapes disagree, no camera has these intrinsics, or the pose is not a rigid
+            transform.
     """
 
     index: int
@@ -80,6 +106,11 @@ class View:
 
     def __post_init__(self) -> None:
         """Check the parts against each other once; trusted afterwards."""
+        for lens in (self.intrinsics, *([self.stereo.intrinsics] if self.stereo else [])):
+            if flaw := lens.flaw():
+                raise ViewError(
+                    f"view {self.index}: {flaw}; give the calibration of the picture, in its pixels"
+                )
         size = (self.intrinsics.height_px, self.intrinsics.width_px)
         for name, image in (
             ("colour", self.color_rgb),

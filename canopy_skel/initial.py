@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from canopy_skel.cluster import require_above_0
 from canopy_skel.geometry import FloatArray, IntArray
 from canopy_skel.graph import SkeletonGraph
 from canopy_skel.kernels import forest, unions
@@ -25,6 +26,10 @@ class InitialConfig:
     bandwidth_m: float = 0.012
     max_angle_deg: float = 45.0
     spur_m: float = 0.02
+
+    def __post_init__(self) -> None:
+        """Refuse a bandwidth that is none."""
+        require_above_0("bandwidth_m", self.bandwidth_m)
 
     @property
     def smoothing(self) -> SmoothingConfig:

@@ -50,6 +50,12 @@ class LikelihoodConfig:
                 f"voxel size {self.voxel_size_m} m: give a length above 0 and up to"
                 f" {THICKEST_VOXEL_M}, such as 0.005"
             )
+        if not 0.1 <= self.k <= 100:
+            raise UsageError(f"k {self.k}: give 0.1 to 100, such as the paper's 3")
+        if not 0 < self.max_confidence < 1:
+            raise UsageError(
+                f"max_confidence {self.max_confidence}: give one above 0 and below 1, such as 0.999"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

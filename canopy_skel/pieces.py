@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canopy_skel.cluster import FARTHEST_M, require_range
+from canopy_skel.cluster import FARTHEST_M, THICKEST_M, require_above_0, require_range
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import FloatArray, IntArray, transform_points
@@ -19,6 +19,8 @@ from canopy_skel.spline import BranchSpline
 
 SAID = 5
 """Figures that a network says of a region, see `Regions`."""
+_LEAST_DISPARITY = 0.05
+"""Per metre, or that of twice the farthest depth: a line that runs on to less is no wood's."""
 _MOST_KNOTS = 8
 """As in `kernels.profile`, which must not be compiled for settings."""
 
@@ -42,14 +44,15 @@ class PieceConfig:
     farthest_m: float = FARTHEST_M
     tolerance_m: float = 0.012
     min_valid_share: float = 0.15
-    thickest_m: float = 0.15
+    thickest_m: float = THICKEST_M
     thickest_fragment_m: float = 0.04
     centre_shift: float = np.pi / 4
     way_px: float = 60.0
 
     def __post_init__(self) -> None:
-        """Refuse a range of depth that is none, and knots for which kernels have no room."""
+        """Refuse ranges that are none, and knots for which kernels have no room."""
         require_range(self.nearest_m, self.farthest_m)
+        require_above_0("tolerance_m", self.tolerance_m)
         if not 2 <= self.fragment_knots <= _MOST_KNOTS or self.knot_px <= 0:
             raise UsageError(
                 f"{self.fragment_knots} knots for a fragment, one every {self.knot_px} px: give"
@@ -127,6 +130,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         config.fragment_knots if fragments else profile.MAX_KNOTS,
         config.tolerance_m,
         config.min_valid_share,
+        min(_LEAST_DISPARITY, 0.5 / config.farthest_m),
     )
     kept, radius_m, points = _lifted(view, counts, knots, quality, config, fragments=fragments)
     return [

@@ -23,7 +23,7 @@ from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
 from canopy_skel.poses import LoneView, PoseCorrection
-from canopy_skel.segment import Segmenter
+from canopy_skel.segment import Segmenter, require_masks
 from canopy_skel.segmenters.mapping import WithMaps
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 from canopy_skel.spline import BranchSpline, SplineConfig, fit_splines
@@ -171,7 +171,8 @@ class Skeletonizer:
 
         Raises:
             ViewError: the view cannot be used; nothing has changed.
-            UsageError: the map would not fit into memory; nothing has changed.
+            UsageError: with it the map would not fit into memory; nothing has changed, and other
+                views may fit.
         """
         if view.index in self._known:
             return self._known[view.index].shown
@@ -180,6 +181,7 @@ class Skeletonizer:
             return self._observe(view)
         with self._stage("segment"):
             masks = self._segmenter.segment(view)
+            require_masks(view, masks)
         with self._stage("cluster"):
             clusters, rejected = cluster_branches(view, masks, self._config.cluster)
         with self._stage("spline"):
@@ -203,6 +205,7 @@ class Skeletonizer:
                 masks, maps = self._with_maps.segment_and_map(view)
             else:
                 masks = self._segmenter.segment(view)
+            require_masks(view, masks)
         with self._stage("observe"):
             seen = self._canopy.observe(view, masks, maps)
         with self._stage("likelihood"):

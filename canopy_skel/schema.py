@@ -132,6 +132,13 @@ def _check_branches(value: dict[str, Any]) -> None:
                 )
             entered.add(b)
         vertices_of[branch["id"]] = set(path)
+    for i, branch in enumerate(value["branches"]):
+        start = branch["vertices"][0]
+        if branch["parent"] is None and start in entered:
+            raise DocumentError(
+                f"branches[{i}] has no parent but starts at vertex {start}, which a branch leads"
+                " to; name the branch it grows from and list it after that"
+            )
     if value["root"] in entered:
         raise DocumentError(
             f"root is vertex {value['root']}, which a branch leads to; name the vertex where the"

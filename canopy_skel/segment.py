@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from canopy_skel.errors import ViewError
 from canopy_skel.frame import UInt16Array, View
 from canopy_skel.geometry import BoolArray
 
@@ -35,6 +36,33 @@ class Segmenter(Protocol):
             ViewError: the view lacks what this segmenter needs.
         """
         ...
+
+
+def require_masks(view: View, masks: Sequence[BranchMask]) -> None:
+    """Check that masks of a view are what `BranchMask` says: anybody may write a segmenter.
+
+    Raises:
+        ViewError: one is not.
+    """
+    height, width = view.color_rgb.shape[:2]
+    for mask in masks:
+        name = f"view {view.index}: the mask of instance {mask.instance}"
+        if mask.mask.dtype != np.bool_ or mask.mask.ndim != 2:
+            raise ViewError(
+                f"{name} is {mask.mask.ndim}-D {mask.mask.dtype}; its segmenter must give 2-D bool"
+            )
+        right, bottom = mask.left_px + mask.mask.shape[1], mask.top_px + mask.mask.shape[0]
+        if min(mask.left_px, mask.top_px) < 0 or right > width or bottom > height:
+            raise ViewError(
+                f"{name} covers columns {mask.left_px} to {right} and rows {mask.top_px} to"
+                f" {bottom} of a picture of {width}x{height}; its segmenter must cut it off at the"
+                " border"
+            )
+        if not 0.0 <= mask.confidence <= 1.0:
+            raise ViewError(
+                f"{name} has a confidence of {mask.confidence}; its segmenter must give one from 0"
+                " to 1"
+            )
 
 
 def painted(

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from canopy_skel.cluster import BranchCluster
+from canopy_skel.errors import UsageError
 from canopy_skel.geometry import FloatArray
 from canopy_skel.kernels import fit
 
@@ -26,6 +27,14 @@ class SplineConfig:
     min_weight: float = 2.0
     centre_shift: float = np.pi / 4
     radius: Literal["extent", "outline"] = "outline"
+
+    def __post_init__(self) -> None:
+        """Refuse what is no polyline."""
+        if self.control_points < 2:
+            raise UsageError(
+                f"control_points {self.control_points}: a polyline has two at least; the paper's"
+                " are 4"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)

@@ -52,10 +52,14 @@ class ReplayRequest:
 
 @dataclass(kw_only=True, slots=True)
 class _Walk:
-    """What has come of the views so far; `picture` is the view that showed most wood."""
+    """What has come of the views so far; `picture` is the view that showed most wood.
+
+    no_room: why the map had no room for the first view that was lost so.
+    """
 
     skeletonizer: Skeletonizer
     rejected: list[RejectedView] = field(default_factory=list)
+    no_room: UsageError | None = None
     picture: View | None = None
     most_pieces: int = -1
 
@@ -160,6 +164,8 @@ def _walk_views(
             _add(walk, view, stopwatch)
             progress(done, recording.view_count)
     if not walk.skeletonizer.views:
+        if walk.no_room:
+            raise walk.no_room
         reason = walk.rejected[0].reason if walk.rejected else "it holds no view"
         raise RecordingError(f"{recording.path}: no view is usable; the first: {reason}")
     return walk
@@ -191,7 +197,9 @@ def _add(walk: _Walk, view: View | RejectedView, stopwatch: Stopwatch) -> None:
         with stopwatch("stereo"):
             view = with_depth(view)
         pieces = walk.skeletonizer.add_view(view)
-    except ViewError as error:
+    except (ViewError, UsageError) as error:
+        if isinstance(error, UsageError):  # One false mask can be too large, as in a live scan.
+            walk.no_room = walk.no_room or error
         walk.rejected.append(RejectedView(index=view.index, reason=str(error)))
         return
     if pieces > walk.most_pieces:

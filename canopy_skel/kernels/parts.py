@@ -10,48 +10,75 @@ from numpy.typing import NDArray
 
 from canopy_skel.kernels.axes import diagonalise, scatter_of
 from canopy_skel.kernels.compiled import inner, kernel
+from canopy_skel.kernels.heap import is_before, pop_row, push_row
 from canopy_skel.kernels.median import median_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Int32s = NDArray[np.int32]
 
 
-@inner("int64(float64[:,::1], int64, int64, float64, int64[:,::1])")
-def cells_of(points: Floats, first: int, end: int, cell_m: float, cells: Ints) -> int:
-    """Write the cells (3,) of points [first, end), from their lowest corner on.
-
-    Row end - first takes how many cells there are along each axis; returns how many in all.
-    """
-    total = 1
+@inner("void(float64[:,::1], int64, int64, float64, int64[:,::1])")
+def cells_of(points: Floats, first: int, end: int, cell_m: float, cells: Ints) -> None:
+    """Write the cells (3,) of points [first, end), from their lowest corner on."""
     for j in range(3):
-        low, most = math.inf, 0
+        low = math.inf
         for n in range(first, end):
             low = min(low, points[n, j])
         for n in range(first, end):
-            cell = math.floor((points[n, j] - low) / cell_m)
-            cells[n - first, j] = cell
-            most = max(most, cell + 1)
-        cells[end - first, j] = most
-        total *= most
-    return total
+            cells[n - first, j] = math.floor((points[n, j] - low) / cell_m)
 
 
-@inner("void(int32[::1], int64[::1], int64, int64, int32[::1])")
-def flood(grid: Int32s, shape: Ints, cell: int, number: int, stack: Int32s) -> None:
+@inner("int64(int64[:,::1], int64, int64[:,::1])")
+def sorted_cells(cells: Ints, count: int, ascending: Ints) -> int:
+    """Write each of `count` cells once, in ascending order; return how many there are.
+
+    Not a grid of the box around them: what is long and slanting has few cells in a vast box.
+    """
+    heap = np.zeros((count + 2, 3), dtype=np.int64)
+    for n in range(count):
+        x, y, z = cells[n, 0], cells[n, 1], cells[n, 2]
+        # Most pixels lie in the cell of the one before.
+        if n == 0 or cells[n - 1, 0] != x or cells[n - 1, 1] != y or cells[n - 1, 2] != z:
+            push_row(heap, x, y, z)
+    different = 0
+    while heap[0, 0] > 0:
+        x, y, z = heap[1, 0], heap[1, 1], heap[1, 2]
+        if different == 0 or is_before(ascending, different - 1, x, y, z):
+            ascending[different, 0], ascending[different, 1], ascending[different, 2] = x, y, z
+            different += 1
+        pop_row(heap)
+    return different
+
+
+@inner("int64(int64[:,::1], int64, int64, int64, int64)")
+def place_of(ascending: Ints, count: int, x: int, y: int, z: int) -> int:
+    """Return the first place of `count` ascending cells that is not before (x, y, z)."""
+    low, high = 0, count
+    while low < high:
+        middle = (low + high) // 2
+        if is_before(ascending, middle, x, y, z):
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inner("void(int64[:,::1], int64, int64, int64, int64[::1], int64[::1])")
+def flood(ascending: Ints, count: int, cell: int, number: int, numbers: Ints, stack: Ints) -> None:
     """Give a cell (-1) and all that touch it, by a corner at least, their number."""
-    grid[cell], stack[0], count = number, cell, 1
-    while count > 0:
-        count -= 1
-        here = int(stack[count])
-        x, y, z = here // (shape[1] * shape[2]), here // shape[2] % shape[1], here % shape[2]
-        for a in range(max(x - 1, 0), min(x + 2, shape[0])):
-            for b in range(max(y - 1, 0), min(y + 2, shape[1])):
-                for c in range(max(z - 1, 0), min(z + 2, shape[2])):
-                    other = (a * shape[1] + b) * shape[2] + c
-                    if grid[other] == -1:
-                        grid[other], stack[count] = number, other
-                        count += 1
+    numbers[cell], stack[0], waiting = number, cell, 1
+    while waiting > 0:
+        waiting -= 1
+        here = stack[waiting]
+        x, y, z = ascending[here, 0], ascending[here, 1], ascending[here, 2]
+        for a in range(x - 1, x + 2):
+            for b in range(y - 1, y + 2):
+                other = place_of(ascending, count, a, b, z - 1)
+                while other < count and is_before(ascending, other, a, b, z + 2):
+                    if numbers[other] == -1:
+                        numbers[other], stack[waiting] = number, other
+                        waiting += 1
+                    other += 1
 
 
 @kernel("Tuple((int64[::1], int64[::1]))(float64[:,::1], int64[::1], float64)")
@@ -65,22 +92,21 @@ def parts_of(points: Floats, start: Ints, cell_m: float) -> tuple[Ints, Ints]:
     parts = 0
     for i in range(len(start) - 1):
         first, count = start[i], start[i + 1] - start[i]
-        if count == 0:
-            continue
-        cells = np.empty((count + 1, 3), dtype=np.int64)
-        total, shape = cells_of(points, first, start[i + 1], cell_m, cells), cells[count]
-        grid, stack = np.zeros(total, dtype=np.int32), np.empty(count, dtype=np.int32)
-        for n in range(count):
-            grid[(cells[n, 0] * shape[1] + cells[n, 1]) * shape[2] + cells[n, 2]] = -1
-        before = parts
-        for cell in range(total):
-            if grid[cell] == -1:
+        cells = np.empty((count, 3), dtype=np.int64)
+        ascending = np.empty((count, 3), dtype=np.int64)
+        cells_of(points, first, start[i + 1], cell_m, cells)
+        different = sorted_cells(cells, count, ascending)
+        numbers, stack = np.empty(different, dtype=np.int64), np.empty(different, dtype=np.int64)
+        for cell in range(different):
+            numbers[cell] = -1
+        for cell in range(different):
+            if numbers[cell] == -1:
                 group[parts] = i
+                flood(ascending, different, cell, parts, numbers, stack)
                 parts += 1
-                flood(grid, shape, cell, parts - before, stack)
         for n in range(count):
-            cell = (cells[n, 0] * shape[1] + cells[n, 1]) * shape[2] + cells[n, 2]
-            part[first + n] = before + grid[cell] - 1
+            cell = place_of(ascending, different, cells[n, 0], cells[n, 1], cells[n, 2])
+            part[first + n] = numbers[cell]
     return part, group[:parts].copy()
 
 

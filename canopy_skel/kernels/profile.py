@@ -237,7 +237,7 @@ def seen(z: Floats, x: Floats, d: Floats) -> int:
 
 @inner(
     "int64(float64[::1], float64[::1], float64[::1], float64[::1], float64, float64, int64,"
-    " float64, float64, float64[:,::1], float64[::1])"
+    " float64, float64, float64, float64[:,::1], float64[::1])"
 )
 def fit_region(
     u: Floats,
@@ -249,6 +249,7 @@ def fit_region(
     max_knots: int,
     tolerance_m: float,
     min_valid: float,
+    least_disparity: float,
     knots: Floats,
     quality: Floats,
 ) -> int:
@@ -279,7 +280,7 @@ def fit_region(
     least = math.inf
     for k in range(count):
         least = min(least, values[k])
-    if inliers < 3 or least <= 0.05:
+    if inliers < 3 or least <= least_disparity:
         return 0
     mu, mv, au, av = axis
     for k in range(count):
@@ -293,7 +294,7 @@ def fit_region(
 
 @kernel(
     "Tuple((int64[::1], float64[:,:,::1], float64[:,::1]))(float64[::1], float64[::1],"
-    " float64[::1], int64[::1], float64[:,::1], float64, float64, int64, float64, float64)"
+    " float64[::1], int64[::1], float64[:,::1], float64, float64, int64, float64, float64, float64)"
 )
 def fit_regions(
     u: Floats,
@@ -306,11 +307,13 @@ def fit_regions(
     max_knots: int,
     tolerance_m: float,
     min_valid: float,
+    least_disparity: float,
 ) -> tuple[Ints, Floats, Floats]:
     """Fit R regions; region i holds the pixels start[i] up to start[i + 1].
 
     ways: (R, 2) cos 2θ and sin 2θ of directions (u right, v down) known beforehand, times the
     difference of squared spreads (px²) along and across at which they count as much as the pixels.
+    least_disparity: a region whose line runs on to less (1/m) is none.
 
     Returns knots per region (R,), rows (R, MAX_KNOTS, 3) of (u, v, disparity), quality (R, Q).
     """
@@ -322,7 +325,7 @@ def fit_regions(
         a, b = start[i], start[i + 1]
         counts[i] = fit_region(
             u[a:b], v[a:b], z[a:b], ways[i], f_px, knot_px, max_knots, tolerance_m, min_valid,
-            knots[i], quality[i],
+            least_disparity, knots[i], quality[i],
         )  # fmt: skip
     return counts, knots, quality
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from canopy_skel.document import Method, RejectedView, SkeletonDocument, build_document, from_json
-from canopy_skel.errors import CanopyError, RecordingError, ViewError
+from canopy_skel.errors import CanopyError, RecordingError, UsageError, ViewError
 from canopy_skel.frame import View
 from canopy_skel.geometry import FloatArray
 from canopy_skel.graph import SkeletonGraph
@@ -159,7 +159,7 @@ def _add_all(skeletonizer: Skeletonizer, views: Sequence[View]) -> None:
     for view in views:
         try:
             skeletonizer.add_view(view)
-        except ViewError as error:
+        except (ViewError, UsageError) as error:
             reasons.append(str(error))
     if not skeletonizer.views:
         raise ViewError(f"no view is usable; the first: {reasons[0] if reasons else 'none'}")

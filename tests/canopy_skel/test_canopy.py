@@ -210,6 +210,23 @@ def test_a_wall_is_no_branch():
     assert len(pieces_of(view, regions, thicker, fragments=False)) == 1
 
 
+@pytest.mark.parametrize("metres", [15.0, 30.0, 59.0])
+def test_wood_counts_as_far_away_as_the_settings_say(metres):
+    pole = np.zeros((240, 320), np.uint16)
+    pole[100:104, 20:300] = 1
+    view = replace(
+        PLAIN,
+        intrinsics=replace(PLAIN.intrinsics, fx_px=2000, fy_px=2000),
+        instances=pole,
+        scores=(0.9,),
+        depth_m=np.full((240, 320), metres, dtype=np.float32),
+    )
+    regions = regions_of_masks(RecordedSegmenter().segment(view))
+    (piece,) = pieces_of(view, regions, PieceConfig(farthest_m=60.0), fragments=False)
+    distances = np.linalg.norm(piece.spline.control_points_in_base, axis=1)
+    assert distances == pytest.approx(metres, rel=0.02)
+
+
 @pytest.mark.parametrize("degrees", [0, 35, 90, 160])
 def test_a_small_fragment_runs_as_the_network_says_and_a_long_one_as_its_pixels_do(degrees):
     angle = np.radians(degrees)

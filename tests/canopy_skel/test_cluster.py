@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,10 +9,9 @@ from oracles import naive_cluster
 from canopy_skel.cluster import ClusterConfig, cluster_branches, principal_axes
 from canopy_skel.errors import UsageError, ViewError
 from canopy_skel.frame import Intrinsics, View
-from canopy_skel.kernels.parts import shapes_of
+from canopy_skel.kernels.parts import parts_of, shapes_of
 from canopy_skel.kernels.strip import measure
 from canopy_skel.pieces import PieceConfig
-from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
 
 LENS = Intrinsics(fx_px=400, fy_px=400, cx_px=160, cy_px=100, width_px=320, height_px=200)
@@ -165,9 +166,9 @@ def test_a_blob_is_not_a_branch():
 
 def test_what_fills_more_than_90_degrees_of_view_has_no_thickness():
     """Beyond 1.27 focal lengths the formula of the outline turns negative."""
-    lens = Intrinsics(fx_px=25, fy_px=25, cx_px=160, cy_px=100, width_px=320, height_px=200)
+    lens = Intrinsics(fx_px=35, fy_px=35, cx_px=160, cy_px=100, width_px=320, height_px=200)
     instances = np.zeros((200, 320), np.uint16)
-    instances[70:130, 10:310] = 1
+    instances[60:140, 10:310] = 1
     view = View(
         index=0,
         stamp_ns=0,
@@ -181,6 +182,14 @@ def test_what_fills_more_than_90_degrees_of_view_has_no_thickness():
     clusters, rejected = cluster_branches(view, RecordedSegmenter().segment(view), CONFIG)
     assert clusters == []
     assert [r.reason for r in rejected] == ["wider than 90 degrees"]
+
+
+def test_what_is_thicker_than_a_branch_is_none():
+    depth_m, instances = np.full((200, 320), 2.9), np.zeros((200, 320))
+    instances[70:130, 10:310] = 1
+    clusters, rejected = clusters_of(depth_m, instances)
+    assert clusters == []
+    assert [r.reason for r in rejected] == ["thicker than a branch"]
 
 
 @pytest.mark.parametrize("config", [ClusterConfig, PieceConfig])
@@ -206,21 +215,50 @@ def test_a_view_without_depth_says_what_to_do():
         clusters_of(None, stick()[1])
 
 
+@pytest.mark.parametrize("far_m", [1.0, 3e4])
+def test_parts_that_are_far_apart_take_no_room_between_them(far_m):
+    spot = np.linspace(0.0, 0.05, 10)[:, None] * [1.0, 1.0, 1.0]
+    part, group = parts_of(np.concatenate([spot + far_m, spot]), np.array([0, 0, 20]), 0.03)
+    assert part.tolist() == [1] * 10 + [0] * 10
+    assert group.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"fx_px": np.nan},
+        {"fy_px": np.inf},
+        {"fx_px": 0.0},
+        {"fy_px": -400.0},
+        {"fx_px": 1e-9},
+        {"cx_px": np.nan},
+        {"cy_px": -1e30},
+        {"cx_px": 641.0},
+        {"fx_px": 0.69, "fy_px": 0.69, "cx_px": 0.5, "cy_px": 0.5},
+    ],
+)
+def test_a_view_with_intrinsics_that_no_camera_has_is_refused(wrong):
+    """Its points would lie so far away that their cells could not be numbered."""
+    depth_m, instances = stick()
+    with pytest.raises(ViewError, match=r"view 0: [fc]x = .*; give the calibration"):
+        View(
+            index=0,
+            stamp_ns=0,
+            color_rgb=np.zeros((200, 320, 3), np.uint8),
+            intrinsics=replace(LENS, **wrong),
+            base_from_camera=np.eye(4),
+            depth_m=depth_m.astype(np.float32),
+            instances=instances.astype(np.uint16),
+            scores=(0.9,),
+        )
+
+
 def test_a_thin_mask_is_not_eroded_away():
     depth_m, instances = stick()
     instances[:] = 0
     instances[99:101, 60:260] = 1
     (cluster,), _ = clusters_of(depth_m, instances)
     assert len(cluster.points_in_base) == 2 * 200
-
-
-def test_a_mask_outside_the_picture_is_refused():
-    view = view_with(*stick())
-    masks = [
-        BranchMask(instance=7, left_px=300, top_px=5, mask=np.ones((4, 30), bool), confidence=0.5)
-    ]
-    with pytest.raises(ViewError, match=r"instance 7 covers columns 300 to 330"):
-        cluster_branches(view, masks, CONFIG)
 
 
 def test_no_masks_give_no_clusters():

@@ -215,6 +215,11 @@ BROKEN = {
     "unknown parent": (set_at("branches", 1, "parent", 7), r"branches\[1\] starts .* branch 7"),
     "own parent": (set_at("branches", 1, "parent", 1), r"branches\[1\] starts .* branch 1"),
     "id twice": (set_at("branches", 1, "id", 0), r"branches\[1\]\.id 0 is taken"),
+    "torn off": (set_at("branches", 1, "parent", None), r"branches\[1\] has no parent but starts"),
+    "torn off ahead of what leads there": (
+        lambda value: value["branches"].insert(0, {**value["branches"].pop(1), "parent": None}),
+        r"branches\[0\] has no parent but starts at vertex 2, which a branch leads to",
+    ),
     "inward": (
         lambda value: value["branches"][1].update(vertices=[4, 2], parent=None),
         r"branches\[1\] reaches vertex 2 a second time",

@@ -4,6 +4,7 @@ import json
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import networkx as nx
@@ -372,3 +373,30 @@ def test_graphml_opens_in_networkx_with_all_values(name):
     for branch in made.branches:
         length = sum(d["length"] for _, _, d in graph.edges(data=True) if d["branch"] == branch.id)
         assert length == pytest.approx(branch.length, abs=1e-5 * len(branch.vertices))
+
+
+def test_graphml_has_further_arrays_of_one_value_per_vertex():
+    extra = {
+        "source": ("observed", "link"),
+        "leafy": (0.5, 1),
+        "segmented": (True, False),
+        'a "b"\x01': (1, 2),
+        "pair": ([1, 2], [3, 4]),
+        "mixed": (1, "one"),
+    }
+    made = replace(DOCUMENTS["one edge"](), extra=extra)
+    graph = nx.read_graphml(io.BytesIO(FORMATS["graphml"](made)), node_type=int)
+    further = [{name: values.get(name) for name in extra} for _, values in graph.nodes(data=True)]
+    nothing = {'a "b"\x01': None, "pair": None, "mixed": None}
+    assert further == [
+        {"source": "observed", "leafy": 0.5, "segmented": True, **nothing},
+        {"source": "link", "leafy": 1.0, "segmented": False, **nothing},
+    ]
+    assert [values['a "b"\ufffd'] for _, values in graph.nodes(data=True)] == [1, 2]
+
+
+@pytest.mark.parametrize("letter", ["\x00", "\x01", "\x1f", "\ufffe", "\uffff"])
+def test_graphml_replaces_what_xml_cannot_hold(letter):
+    made = document([(1, 0, 0)], [], scan_id=f"row {letter} 3\U0001f333\x7f")
+    graph = nx.read_graphml(io.BytesIO(FORMATS["graphml"](made)))
+    assert graph.graph["scan_id"] == "row \ufffd 3\U0001f333\x7f"

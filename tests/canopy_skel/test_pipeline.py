@@ -3,13 +3,21 @@ import pytest
 from scenes.leaves import leafy_view
 from scenes.wood import WOOD, view_from
 
+from canopy_skel.canopy import CanopyConfig
+from canopy_skel.cluster import ClusterConfig
 from canopy_skel.document import Method, build_document, to_json
 from canopy_skel.errors import UsageError, ViewError
+from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import View
+from canopy_skel.graph import SOURCES
+from canopy_skel.initial import InitialConfig
 from canopy_skel.likelihood import LikelihoodConfig
+from canopy_skel.pieces import PieceConfig
 from canopy_skel.pipeline import JOINERS, METHODS, MethodConfig, Skeletonizer
 from canopy_skel.recording import read_recording
+from canopy_skel.segment import BranchMask
 from canopy_skel.segmenters.recorded import RecordedSegmenter
+from canopy_skel.spline import SplineConfig
 from drivers.stereo import with_depth
 
 
@@ -210,9 +218,78 @@ def test_a_view_from_far_away_is_refused_before_it_stretches_the_map(views):
     assert maker.views == (0,)
 
 
+class Fixed:
+    """A segmenter that finds one branch, the same in every view."""
+
+    def __init__(self, **wrong):
+        mask = {"left_px": 5, "top_px": 5, "mask": np.ones((4, 30), np.bool_), "confidence": 0.9}
+        self.masks = [BranchMask(instance=7, **(mask | wrong))]
+
+    def segment(self, view):
+        return self.masks
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"left_px": 300}, "covers columns 300 to 330"),
+        ({"top_px": 237}, "rows 237 to 241 of a picture of 320x240"),
+        ({"left_px": -1}, "covers columns -1 to 29"),
+        ({"mask": np.ones((4, 30), np.uint8)}, "is 2-D uint8"),
+        ({"mask": np.ones(30, np.bool_)}, "is 1-D bool"),
+        ({"confidence": np.nan}, "has a confidence of nan"),
+        ({"confidence": 1.5}, "has a confidence of 1.5"),
+        ({"confidence": -0.1}, "has a confidence of -0.1"),
+    ],
+)
+def test_a_mask_that_cannot_be_costs_the_view(views, wrong, says, name):
+    maker = Skeletonizer(Fixed(**wrong), MethodConfig(name=name))
+    with pytest.raises(ViewError, match=f"view 0: the mask of instance 7 .*{says}"):
+        maker.add_view(views[0])
+    assert maker.views == ()
+
+
 def test_a_mask_without_confidence_counts_for_nothing(views):
     maker = skeletonizer()
     assert maker.add_view(view_from(0, scores=(0.9, 0.0, 0.9))) == 2
+
+
+@pytest.mark.parametrize(
+    ("config", "wrong"),
+    [
+        (ExtensionConfig, {"step_m": 0.0}),
+        (ExtensionConfig, {"reach_m": -0.1}),
+        (ExtensionConfig, {"reach_m": np.inf}),
+        (SplineConfig, {"control_points": 1}),
+        (SplineConfig, {"control_points": 0}),
+        (LikelihoodConfig, {"k": np.nan}),
+        (LikelihoodConfig, {"k": 0.0}),
+        (LikelihoodConfig, {"k": -1.0}),
+        (LikelihoodConfig, {"max_confidence": 1.0}),
+        (PieceConfig, {"tolerance_m": 0.0}),
+        (ClusterConfig, {"tolerance_m": np.nan}),
+        (ClusterConfig, {"connect_m": 0.0}),
+        (InitialConfig, {"bandwidth_m": 0.0}),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named_with_its_value(config, wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(UsageError, match=rf"{name} {value}\b.*: .*(give|at least)"):
+        config(**wrong)
+
+
+def test_a_reach_of_less_than_a_step_means_no_extensions():
+    def extended(reach_m):
+        extensions = ExtensionConfig(reach_m=reach_m, min_probability=0.0)
+        maker = Skeletonizer(
+            RecordedSegmenter(), MethodConfig(canopy=CanopyConfig(extensions=extensions))
+        )
+        maker.add_view(leafy_view(0))
+        return np.count_nonzero(maker.skeleton().graph.source == SOURCES.index("extension"))
+
+    assert extended(0.1) > 0
+    assert extended(0.0) == extended(0.002) == 0
 
 
 def test_an_unknown_method_names_the_known_ones():

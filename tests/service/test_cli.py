@@ -20,6 +20,7 @@ from canopy_skel.pipeline import MethodConfig
 from canopy_skel.recording import RecordingWriter
 from canopy_skel.woodpixels import pixel_model_from, pixel_model_to, shipped_pixel_model
 from service.lessons import fitted, lessons_from, pixel_models_without
+from service.replay import ReplayRequest, replay
 
 ROOT = Path(__file__).parents[2]
 
@@ -240,6 +241,25 @@ def test_wrong_arguments_are_usage_errors(canopy, recording, tmp_path, arguments
     assert line.startswith("error: ")
     assert says in line
     assert not out.exists() or list(out.iterdir()) == []
+
+
+def test_a_replay_loses_only_the_view_for_which_the_map_has_no_room(tmp_path):
+    wide = np.zeros((240, 320), np.uint16)
+    wide[100:130, 10:310] = 1
+    far = np.full((240, 320), 2.5, np.float32)
+    path = tmp_path / "wide.mcap"
+    write(path, [view_from(0), view_from(1, instances=wide, depth_m=far), view_from(2, z=0.1)])
+    request = ReplayRequest(
+        config=MethodConfig(name="paper"),
+        segmenter="recorded",
+        formats=("json",),
+        topics=None,
+        memory_limit_bytes=150 << 20,
+    )
+    document = replay(path, tmp_path, request, lambda done, total: None).document
+    assert document.views_used == 2
+    ((index, reason),) = [(view.index, view.reason) for view in document.views_rejected]
+    assert (index, " m fits" in reason) == (1, True)
 
 
 def test_an_output_folder_that_cannot_be_written_is_found_before_the_work(canopy, recording):

@@ -192,6 +192,13 @@ def test_a_calibration_that_cannot_be(read_broken, changes, text):
     assert reason.endswith("; calibrate the camera, or record what its driver publishes")
 
 
+def test_a_calibration_in_shares_of_the_picture(read_broken):
+    k = [0.94, 0, 0.5, 0, 1.27, 0.5, 0, 0, 1]
+    data = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", K=k)
+    reason = read_broken(**{"/camera/color/calibration": data.SerializeToString()})
+    assert "fx = 0.94, fy = 1.27 px is no focal length of a picture of 64x48" in reason
+
+
 def test_missing_pose(read_broken):
     reason = read_broken(**{TF: None})
     assert "/tf: no pose base -> tool0 at the exposure (the nearest is 1500.0 ms away" in reason
