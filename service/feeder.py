@@ -305,12 +305,14 @@ class ViewFeeder:
                 return  # it goes on itself
             del self._earlier[scan_id]
             current = self._current
-            known = max(current.views, default=None) if current and self._earlier else None
+            known = min(current.views, default=None) if current and self._earlier else None
         if refused:
             _log.warning("scan %s: no worker takes views %s; given up", scan_id, refused)
         self._on_caught_up(scan_id, len(scan.views), refused)
         if current is not None and known is not None:
-            self._send(current, known)  # a worker keeps the scans it heard of last
+            # A worker keeps the scans it heard of last. The newest view may be one without depth,
+            # which cannot be told from one that is still being written.
+            self._send(current, known)
 
     def _send(self, scan: OfferedScan, index: int) -> None:
         source, one = scan.source, scan.views[index]
