@@ -34,7 +34,6 @@ from canopy_skel.poses import (
 )
 from canopy_skel.segment import BranchMask
 from canopy_skel.slivers import inside_thicker, on_axis
-from canopy_skel.trunks import onto_trunks
 from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
@@ -172,8 +171,7 @@ class CanopyScan:
             view=view,
             fragment=fragment,
         ).chosen(probability >= limit)
-        outlines = [self._seen[index].outlines for index in sorted(self._seen)]
-        seen = on_axis(onto_trunks(seen, outlines, self.evidence))
+        seen = on_axis(seen)
         seen = seen.chosen(~inside_thicker(seen))
         fused = fuse(seen, self.config.fusion)
         corrections = pose_corrections(seen, fused, self.config.poses)

@@ -8,7 +8,6 @@ from canopy_skel.evidence import ViewEvidence, evidence_of
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels import agree, fuse, profile
-from canopy_skel.outlines import Outlines, outlines_of
 from canopy_skel.pieces import (
     Piece,
     PieceConfig,
@@ -40,8 +39,8 @@ class Observation:
     splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
     instances without enough depth. points_in_base, directions: (N, 3), along the pieces; piece:
     (N,), which of them, ascending; radius_m, fragment: (N,); quality: (N, 12), see `_quality`.
-    evidence: the view, ready to be asked. outlines: its thick wood. cells: (N,) cell numbers
-    ascending, of the points in the order `by_cell` (N,).
+    evidence: the view, ready to be asked. cells: (N,) cell numbers ascending, of the points in the
+    order `by_cell` (N,).
     """
 
     splines: list[BranchSpline]
@@ -54,7 +53,6 @@ class Observation:
     fragment: BoolArray
     quality: FloatArray
     evidence: ViewEvidence
-    outlines: Outlines
     cells: IntArray
     by_cell: IntArray
 
@@ -96,7 +94,6 @@ def observe(
     regions = regions_of_masks(masks)
     pieces = pieces_of(view, regions, pieces_config, fragments=False)
     lifted = {piece.spline.instance for piece in pieces}
-    outlines = outlines_of(view, regions, pieces, pieces_config)
     wood = mask_image(view, regions)
     with np.errstate(invalid="ignore"):  # Wood of other rows says nothing of this tree's.
         wood &= ~(depth_of(view) > pieces_config.farthest_m)
@@ -120,7 +117,6 @@ def observe(
         fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
         quality=_quality(pieces)[of],
         evidence=evidence_of(view, wood),
-        outlines=outlines,
         cells=cells[by_cell],
         by_cell=by_cell,
     )
