@@ -33,11 +33,12 @@ from service.feeder import ViewFeeder
 from service.heartbeat import Version
 from service.http.access import Access
 from service.http.requests import SpeedCaps
-from service.local_rig import LocalRig, RigParts
+from service.local_rig import LocalRig
 from service.offered import ScanSource
 from service.pictures import recorded_file
 from service.rig import CAUGHT_UP, PartStatus, ScanSpec
 from service.rig_file import WATCHDOG_HZ, RigFile
+from service.rig_parts import RigParts
 from service.scan import Attachments, Stage
 from service.supervisor import Supervised
 
@@ -112,7 +113,7 @@ class BusFeed:
         """Have no more views of such a recording sent."""
         self._feeder.leave(scan_id)
 
-    def offer(self, scan_id: str, index: int, messages: Sequence[Message] = ()) -> None:
+    def offer(self, scan_id: str, index: int, messages: Sequence[Message]) -> None:
         """Have a recorded view sent."""
         self._feeder.offer(index, messages)
 

@@ -7,8 +7,9 @@ import pytest
 from fake_rig import DEMO_RECORDING
 
 from drivers.guarded_arm import Limits
-from service.local_rig import LocalRig, RigParts
+from service.local_rig import LocalRig
 from service.rig import NoRoomError
+from service.rig_parts import RigParts
 
 LIMITS = Limits(box_min_m=(-1.0, -1.0, -1.0), box_max_m=(1.0, 1.0, 1.0))
 

@@ -31,7 +31,7 @@ from drivers.ur5.messages import Ur5Config
 from mock_hw.fake_ur.process import FakeUr, free_host
 from mock_hw.orchard.path import TOOL_FROM_CAMERA, camera_path
 from service.catalogue import Catalogue
-from service.local_rig import LocalRig, RigParts
+from service.local_rig import LocalRig
 from service.rig import (
     PartStatus,
     PlanRefusedError,
@@ -41,6 +41,7 @@ from service.rig import (
     ScanState,
     UnknownScanError,
 )
+from service.rig_parts import RigParts
 
 LIMITS = Limits(box_min_m=(-0.9, -0.9, -0.85), box_max_m=(0.9, 0.9, 1.1))
 WAYPOINTS = tuple(pose @ invert(TOOL_FROM_CAMERA) for pose in camera_path(10))
