@@ -21,6 +21,7 @@ from canopy_skel.recording import read_recording
 from canopy_skel.segmenters.mapping import WithMaps
 from drivers.stereo import with_depth
 from service.experiment.segmenters import segmenter_named
+from service.memory import keep_freed_memory
 
 PAPER, CANOPY = MethodConfig(name="paper"), MethodConfig(name="canopy")
 RUNS = {
@@ -116,6 +117,7 @@ def main():
     parser.add_argument("--worse", action="store_true", help="worse masks too, at medium foliage")
     arguments = parser.parse_args()
     arguments.cache.mkdir(parents=True, exist_ok=True)
+    keep_freed_memory()
     results = {}
     for path in arguments.recordings:
         results[path.stem] = figures_of(path, arguments.cache, RUNS)

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from canopy_skel.fusion import Observations, heaviest
 from canopy_skel.geometry import BoolArray, IntArray
-from canopy_skel.kernels import bark
+from canopy_skel.kernels import bark, fuse
 
 _THICK_M = (0.014, 0.020, 0.028, 0.040, 0.056)
 _TIMES_THINNER = 1.3
@@ -19,6 +19,7 @@ _BARK_RADII = 1.25
 _BARK_TIMES_THINNER = 1.2
 _BARK_MIN_COSINE = 0.9
 _BARK_CELL_M = 0.008
+_BARK_SIDE_M = 0.1
 _APART_M = 0.02
 
 
@@ -33,18 +34,14 @@ def on_axis(seen: Observations) -> Observations:
     if len(thick) == 0:
         return seen
     thick = thick[heaviest(seen.points_in_base[thick], seen.probability[thick], _BARK_CELL_M)]
-    height = seen.points_in_base[:, int(np.ptp(seen.points_in_base[thick], axis=0).argmax())]
-    thick = thick[np.argsort(height[thick], kind="stable")]
-    largest_m = float(seen.radius_m[thick].max())
-    thin = np.flatnonzero(seen.radius_m < largest_m / _BARK_TIMES_THINNER)
-    reach_m = _BARK_REACH_M + _BARK_RADII * largest_m
-    window = [np.searchsorted(height[thick], height[thin] + way) for way in (-reach_m, reach_m)]
+    by_place = np.argsort(fuse.cell_keys(seen.points_in_base[thick], _BARK_SIDE_M), kind="stable")
+    thick = thick[by_place]
+    thin = np.flatnonzero(seen.radius_m < seen.radius_m[thick].max() / _BARK_TIMES_THINNER)
     runs = np.column_stack([seen.points_in_base, seen.directions, seen.radius_m])
     sides = bark.either_side(
         np.ascontiguousarray(runs[thin, :6]),
         seen.radius_m[thin],
         runs[thick],
-        np.stack(window, axis=1),
         np.array(_THICK_M[::-1]),
         np.array([_BARK_REACH_M, _BARK_RADII, _BARK_TIMES_THINNER, _BARK_MIN_COSINE]),
     )

@@ -8,7 +8,8 @@ from scipy.ndimage import gaussian_filter
 
 from canopy_skel.components import pixels_of, runs_of
 from canopy_skel.frame import Float32Array, UInt8Array, View
-from canopy_skel.geometry import BoolArray, IntArray
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.kernels import colours
 from canopy_skel.pieces import Regions, depth_of
 from canopy_skel.woodpixels import MOST_LOGIT, PixelModel, hints_of, lab_of, layers_of
 
@@ -22,14 +23,16 @@ class FragmentConfig:
 
     Pixels outside the masks with a wood probability of at least `min_probability`, connected, at
     least `min_px`. Pixels are not asked whose colour has log odds under `min_log_odds`, unless the
-    network gives them a logit of `min_logit`. They count within `margin_m` of the depths the masks
-    span, so that rows behind stay out. Colours are told apart in Lab bins after smoothing;
+    network gives them a logit of `min_logit`, nor those around which it gives none of
+    `min_logit_around`, where next to nothing would be found. They count within `margin_m` of the
+    depths the masks span, so that rows behind stay out. Colours are told apart in Lab bins;
     `shrink_px` pixels of nothing-known are added to each, so that a colour seldom seen says little.
     """
 
     min_probability: float = 0.3
     min_log_odds: float = -1.0
     min_logit: float = 0.0
+    min_logit_around: float = -4.0
     blur_px: int = 3
     min_px: int = 10
     max_px: int = 4000
@@ -60,22 +63,27 @@ def wood_probability(
     probability = np.zeros(covered.shape, dtype=np.float32)
     lab = lab_of(view)
     log_odds, mean_odds = colour_log_odds(view, lab, covered, config)
-    v, u = asked_pixels(mean_odds, maps, config)
+    hints = hints_of(maps)
+    v, u = asked_pixels(mean_odds, hints, config)
     if len(v) == 0:
         return probability
     layers = layers_of(view, lab, covered, log_odds)
-    probability[v, u] = model.probability(layers, hints_of(maps), mean_odds[v, u], v, u)
+    probability[v, u] = model.probability(layers, hints, mean_odds[v, u], v, u)
     return probability
 
 
 def asked_pixels(
-    mean_odds: Float32Array, maps: Float32Array, config: FragmentConfig
+    mean_odds: Float32Array, hints: Float32Array, config: FragmentConfig
 ) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the pixels that by colour or network may be wood."""
-    height, width = mean_odds.shape
-    logit = cv2.resize(maps[0], (width, height), interpolation=cv2.INTER_LINEAR)
-    asked = (mean_odds >= config.min_log_odds) | (logit >= config.min_logit)
-    v, u = np.divmod(np.flatnonzero(asked & (mean_odds > -np.inf)), width)
+    """Return rows and columns of the pixels that by colour or network may be wood.
+
+    mean_odds: (H, W), of `colour_log_odds`. hints: (h, w, HINTS), of `hints_of`.
+    """
+    sure, around = hints[..., 0] >= config.min_logit, hints[..., 3] >= config.min_logit_around
+    size = mean_odds.shape[::-1]
+    flags = cv2.resize(sure + np.uint8(2) * around, size, interpolation=cv2.INTER_NEAREST)
+    asked = (mean_odds >= config.min_log_odds) | (mean_odds > -np.inf) & (np.asarray(flags) % 2 > 0)
+    v, u = np.divmod(np.flatnonzero(asked & (flags >= 2)), size[0])
     return v, u
 
 
@@ -89,36 +97,40 @@ def colour_log_odds(
     of others are negative infinite.
     """
     near = at_tree(view, covered, config)
-    mean = np.full(covered.shape, -np.inf, dtype=np.float32)
-    wood, other = near & covered, near & ~covered
-    if not wood.any() or not other.any():
-        return np.zeros(covered.shape, dtype=np.float32), mean
-    lightness, *colours = (np.asarray(one, dtype=np.uint8) for one in cv2.split(lab))
-    bins = (lightness >> 3).astype(np.int32)
-    for one in colours:
-        bins <<= 6
-        bins |= one >> 2
-    of_wood, of_other = (_histogram(bins[chosen]) for chosen in (wood, other))
+    other = near & ~covered
+    counts = colours.count_colours(lab, near, covered)
+    if not counts.any(axis=1).all():
+        nothing = np.zeros(covered.shape, dtype=np.float32)
+        return nothing, np.full(covered.shape, -np.inf, dtype=np.float32)
+    of_wood, of_other = map(_spread, counts)
     known = config.shrink_px * (of_wood + of_other) / (of_wood.sum() + of_other.sum()) + 1e-9
     share_wood = (of_wood + known) / (of_wood.sum() + known.sum())
     share_other = (of_other + known) / (of_other.sum() + known.sum())
-    log_odds = np.log(share_wood / share_other).astype(np.float32).ravel().take(bins)
-    # A pixel's neighbours are mostly what it is; noise is not.
-    size = (config.blur_px, config.blur_px)
-    beside = other.astype(np.float32)
-    np.divide(cv2.blur(log_odds * beside, size), cv2.blur(beside, size), out=mean, where=other)
-    return log_odds, mean
+    log_odds = colours.look_up(lab, np.log(share_wood / share_other).astype(np.float32).ravel())
+    return log_odds, _mean_among(log_odds, other, config.blur_px)
+
+
+def _mean_among(log_odds: Float32Array, chosen: BoolArray, blur_px: int) -> Float32Array:
+    """Return means of chosen pixels (H, W) and the chosen around them, negative infinite elsewhere.
+
+    A pixel's neighbours are mostly what it is; noise is not.
+    """
+    size, mean = (blur_px, blur_px), np.full(chosen.shape, -np.inf, dtype=np.float32)
+    total = cv2.boxFilter(log_odds * chosen, -1, size, normalize=False)
+    count = cv2.boxFilter(chosen.view(np.uint8), cv2.CV_32F, size, normalize=False)
+    np.divide(total, count, out=mean, where=chosen)
+    return mean
 
 
 def at_tree(view: View, covered: BoolArray, config: FragmentConfig) -> BoolArray:
     """Say which pixels (H, W) lie at the depths that the masks span, give or take the margin."""
     depth_m = depth_of(view)
-    masked = depth_m[covered & np.isfinite(depth_m)]
+    masked = depth_m[covered]
+    masked = masked[np.isfinite(masked)]
     if len(masked) == 0:
         return np.zeros(covered.shape, dtype=np.bool_)
     low, high = np.percentile(masked, [2, 98])
-    with np.errstate(invalid="ignore"):
-        return np.asarray((depth_m >= low - config.margin_m) & (depth_m <= high + config.margin_m))
+    return cv2.inRange(depth_m, low - config.margin_m, high + config.margin_m) > 0
 
 
 def fragments_of(probability: Float32Array, maps: Float32Array, config: FragmentConfig) -> Regions:
@@ -157,17 +169,14 @@ def fragments_of(probability: Float32Array, maps: Float32Array, config: Fragment
     )
 
 
-def _histogram(bins: np.ndarray) -> np.ndarray:
-    counts = np.bincount(bins, minlength=1 << 17).reshape(32, 64, 64).astype(np.float64)
-    used = np.array(np.nonzero(counts))
-    reach = (
-        slice(None)
-        if used.size == 0
-        else tuple(
-            slice(max(low - _SPREAD, 0), high + _SPREAD + 1)
-            for low, high in zip(used.min(axis=1), used.max(axis=1), strict=True)
-        )
-    )
+def _spread(counts: IntArray) -> FloatArray:
+    """Return counts of colours (32, 64, 64), each spread over the bins around its own."""
+    spread = counts.reshape(32, 64, 64).astype(np.float64)
+    used = np.array(np.nonzero(spread))
     # Few of the colours there are occur; beyond what is in reach of these, all is 0.
-    counts[reach] = gaussian_filter(counts[reach], 1.0, mode="nearest", radius=_SPREAD)
-    return counts
+    reach = tuple(
+        slice(max(low - _SPREAD, 0), high + _SPREAD + 1)
+        for low, high in zip(used.min(axis=1), used.max(axis=1), strict=True)
+    )
+    spread[reach] = gaussian_filter(spread[reach], 1.0, mode="nearest", radius=_SPREAD)
+    return spread

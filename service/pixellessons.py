@@ -88,7 +88,8 @@ def _pixels(view: View, finder: WithMaps, tree: cKDTree, radius_m: FloatArray) -
     covered &= ~(depth_m > settings.pieces.farthest_m)
     lab = lab_of(view)
     log_odds, mean_odds = colour_log_odds(view, lab, covered, settings.fragments)
-    v, u = asked_pixels(mean_odds, maps, settings.fragments)
+    hints = hints_of(maps)
+    v, u = asked_pixels(mean_odds, hints, settings.fragments)
     surface = view.intrinsics.back_project(
         u.astype(np.float64), v.astype(np.float64), depth_m[v, u].astype(np.float64)
     )
@@ -97,7 +98,7 @@ def _pixels(view: View, finder: WithMaps, tree: cKDTree, radius_m: FloatArray) -
     shares = np.where(wood, _WOOD_SHARE, _OTHER_SHARE)
     drawn = np.random.default_rng(view.index).random(len(v)) < shares
     v, u, wood, shares = v[drawn], u[drawn], wood[drawn], shares[drawn]
-    layers, hints = layers_of(view, lab, covered, log_odds), hints_of(maps)
+    layers = layers_of(view, lab, covered, log_odds)
     return Pixels(
         figures=figures_of(layers, hints, mean_odds[v, u], v, u),
         wood=wood,

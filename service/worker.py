@@ -33,6 +33,7 @@ from service.envelope import ViewEnvelope, decode_envelope
 from service.heartbeat import PERIOD_S, SCANS_KEPT, Heartbeat, Version
 from service.kernels import compile_kernels
 from service.live import LiveSkeleton, warm_up
+from service.memory import keep_freed_memory
 from service.skeletons import SEGMENTERS
 
 _log = logging.getLogger(__name__)
@@ -215,6 +216,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     cv2.setNumThreads(1)  # arm, bus and browser keep the other cores
+    keep_freed_memory()
     stop = threading.Event()
     _on_signals(sys.exit)  # compiling kernels takes its time, and its processes end with this one
     try:

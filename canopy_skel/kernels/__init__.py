@@ -18,6 +18,7 @@ NEEDED_BY = {
         "around",
         "bark",
         "candidates",
+        "colours",
         "components",
         "fuse",
         "profile",

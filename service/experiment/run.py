@@ -17,6 +17,7 @@ from service.experiment.measure import Task, rows_of
 from service.experiment.orchard import Orchard, Tree
 from service.experiment.rows import Row, RowStore, key_of
 from service.experiment.segmenters import segmenter_named
+from service.memory import keep_freed_memory
 
 MEMORY_LIMIT_BYTES = 3 << 30
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -102,7 +103,7 @@ def _results(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, list[Row]
     for name in _THREADS:
         os.environ.setdefault(name, "1")  # Of the processes that are about to start.
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(tasks)), spawn, _single_threaded) as pool:
+    with ProcessPoolExecutor(min(jobs, len(tasks)), spawn, _begin) as pool:
         try:
             waiting = {pool.submit(rows_of, task): task for task in tasks}
             for future in as_completed(waiting):
@@ -111,5 +112,6 @@ def _results(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, list[Row]
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _single_threaded() -> None:
+def _begin() -> None:
     cv2.setNumThreads(1)
+    keep_freed_memory()

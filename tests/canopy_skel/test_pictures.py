@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 from canopy_skel import wood
 from canopy_skel.components import painted, pixels_of, runs_of
 from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, UNKNOWN, WOOD, evidence_of
-from canopy_skel.kernels import around, verdicts
-from canopy_skel.wood import FragmentConfig, fragments_of
+from canopy_skel.kernels import around, colours, verdicts
+from canopy_skel.wood import FragmentConfig, asked_pixels, fragments_of
 from canopy_skel.woodpixels import PixelModel, figures_of
 
 SHAPES = [(40, 60), (41, 57), (1, 9), (9, 1)]
@@ -122,14 +122,38 @@ def naive_verdict(evidence, point):
     return HIDDEN if np.isfinite(farthest) and farthest < z - margin else UNKNOWN
 
 
-@pytest.mark.parametrize("colours", [0, 1, 2000])
-def test_colours_spread_as_if_all_of_them_were_worked_through(colours):
+@pytest.mark.parametrize("count", [1, 2000])
+def test_colours_spread_as_if_all_of_them_were_worked_through(count):
     random = np.random.default_rng(3)
-    bins = (random.normal(0.5, 0.15, (colours, 3)).clip(0, 0.999) * [32, 64, 64]).astype(np.int64)
+    bins = (random.normal(0.5, 0.15, (count, 3)).clip(0, 0.999) * [32, 64, 64]).astype(np.int64)
     flat = np.ravel_multi_index(tuple(bins.T), (32, 64, 64))
     counts = np.bincount(flat, minlength=1 << 17).reshape(32, 64, 64).astype(np.float64)
     expected = gaussian_filter(counts, 1.0, mode="nearest")
-    np.testing.assert_array_equal(wood._histogram(flat), expected)
+    np.testing.assert_array_equal(wood._spread(np.bincount(flat, minlength=1 << 17)), expected)
+
+
+def test_colours_are_counted_and_looked_up_by_bins_of_8_and_4_levels():
+    random = np.random.default_rng(4)
+    lab = random.integers(0, 256, (30, 41, 3), dtype=np.uint8)
+    lab[:20] //= 16
+    chosen, split = random.random((2, 30, 41)) < 0.6
+    bins = np.ravel_multi_index(tuple(np.moveaxis(lab // [8, 4, 4], 2, 0)), (32, 64, 64))
+    counts = colours.count_colours(lab, chosen, split)
+    for row, flag in zip(counts, (split, ~split), strict=True):
+        np.testing.assert_array_equal(row, np.bincount(bins[chosen & flag], minlength=1 << 17))
+    table = random.random(1 << 17, dtype=np.float32)
+    np.testing.assert_array_equal(colours.look_up(lab, table), table[bins])
+
+
+def test_pixels_are_asked_where_the_network_sees_any_wood_around():
+    hints = np.full((2, 4, around.HINTS), -8.0, np.float32)  # each cell stands for 3 x 3 pixels
+    hints[:, 1:, 3], hints[:, 3, 0] = -1.0, 2.0
+    mean_odds = np.full((6, 12), -3.0, np.float32)
+    mean_odds[1], mean_odds[2] = 0.5, -np.inf
+    v, u = asked_pixels(mean_odds, hints, FragmentConfig())
+    by_network = {(v, u) for v in (0, 1, 3, 4, 5) for u in (9, 10, 11)}
+    by_colour = {(1, u) for u in range(3, 12)}
+    assert set(zip(v.tolist(), u.tolist(), strict=True)) == by_network | by_colour
 
 
 @pytest.mark.parametrize(
