@@ -12,7 +12,6 @@ from canopy_skel.pieces import (
     Piece,
     PieceConfig,
     depth_of,
-    half_width_px,
     pieces_of,
     regions_of_masks,
 )
@@ -132,7 +131,7 @@ def _quality(pieces: list[Piece]) -> FloatArray:
         return np.zeros((0, 12))
     quality = np.array([piece.quality for piece in pieces])
     pixels, length_px, width_px, valid, inlier, lateral = quality.T
-    radius_m = np.array([piece.spline.radius_m for piece in pieces])
+    pixel_m = np.array([piece.pixel_m for piece in pieces])
     cosine, sine, *logits = np.array([piece.said for piece in pieces]).T
     return np.column_stack(
         [
@@ -143,7 +142,7 @@ def _quality(pieces: list[Piece]) -> FloatArray:
             valid,
             inlier,
             lateral,
-            np.log(radius_m * 0.5 * width_px / half_width_px(quality)),
+            np.log(pixel_m * 0.5 * width_px),
             np.hypot(cosine, sine),
             *logits,
         ]

@@ -19,6 +19,7 @@ from canopy_skel.spline import BranchSpline
 
 SAID = 5
 """Figures that a network says of a region, see `Regions`."""
+_RIM_PX, _RADIUS_SHARE = 1.0, 0.15
 _LEAST_DISPARITY = 0.05
 """Per metre, or that of twice the farthest depth: a line that runs on to less is no wood's."""
 _MOST_KNOTS = 8
@@ -67,7 +68,7 @@ class Regions:
     confidence: (R,), the segmenter's score or the mean wood probability. numbers: (R,) instance
     numbers, 0 for fragments. said: (R, 5), what a network says of their pixels: means of cos 2θ and
     sin 2θ of the direction (u right, v down) and of the logits of branch and middle line, and the
-    highest of the latter; 0 without one.
+    highest of the latter; 0 without one. radius_px: (R,), what it says of their radii, NaN without.
     """
 
     u: IntArray
@@ -76,6 +77,7 @@ class Regions:
     confidence: FloatArray
     numbers: IntArray
     said: FloatArray
+    radius_px: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
@@ -83,11 +85,13 @@ class Piece:
     """One region lifted into base: its polyline, and what tells how far to believe it.
 
     quality: (6,) pixels, length_px, width_px, share of pixels with depth, share of these on the
-    profile, lateral deviation over width. said: (5,), see `Regions`.
+    profile, lateral deviation over width. said: (5,), see `Regions`. pixel_m: how much wood a pixel
+    shows there.
     """
 
     spline: BranchSpline
     fragment: bool
+    pixel_m: float
     quality: FloatArray
     said: FloatArray
 
@@ -108,6 +112,9 @@ def regions_of_masks(masks: Sequence[BranchMask]) -> Regions:
         confidence=np.array([mask.confidence for mask in masks], dtype=np.float64),
         numbers=np.array([mask.instance for mask in masks], dtype=np.int64),
         said=np.zeros((len(masks), SAID)),
+        radius_px=np.array(
+            [np.nan if mask.radius_px is None else mask.radius_px for mask in masks]
+        ),
     )
 
 
@@ -132,21 +139,23 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         config.min_valid_share,
         min(_LEAST_DISPARITY, 0.5 / config.farthest_m),
     )
-    kept, radius_m, points = _lifted(view, counts, knots, quality, config, fragments=fragments)
+    radius_px = _radii_px(half_width_px(quality), regions.radius_px, fragments=fragments)
+    kept, pixel_m, points = _lifted(view, counts, knots, radius_px, config, fragments=fragments)
     return [
         Piece(
             spline=BranchSpline(
                 view_index=view.index,
                 instance=int(regions.numbers[i]),
                 confidence=float(regions.confidence[i]),
-                radius_m=float(radius),
+                radius_m=radius_px[i] * pixel,
                 control_points_in_base=line[: counts[i]],
             ),
             fragment=fragments,
+            pixel_m=pixel,
             quality=quality[i],
             said=regions.said[i],
         )
-        for i, radius, line in zip(kept.tolist(), radius_m, points, strict=True)
+        for i, pixel, line in zip(kept.tolist(), pixel_m.tolist(), points, strict=True)
     ]
 
 
@@ -154,25 +163,39 @@ def _lifted(
     view: View,
     counts: IntArray,
     knots: FloatArray,
-    quality: FloatArray,
+    radius_px: FloatArray,
     config: PieceConfig,
     *,
     fragments: bool,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return which regions are no thicker than a branch, their radii (R,), and knots in base."""
+    """Return which regions are no thicker than a branch, their pixels in m (R,), knots in base."""
     kept = np.flatnonzero(counts)
     u, v, disparity = np.moveaxis(knots[kept], 2, 0)
     has = np.arange(knots.shape[1]) < counts[kept, None]
     mean_disparity = np.sum(disparity, axis=1, where=has) / counts[kept]
-    radius_m = half_width_px(quality[kept]) / view.intrinsics.fx_px / mean_disparity
-    slender = radius_m <= (config.thickest_fragment_m if fragments else config.thickest_m)
-    kept, radius_m, has = kept[slender], radius_m[slender], has[slender]
+    pixel_m = 1.0 / view.intrinsics.fx_px / mean_disparity
+    thickest_m = config.thickest_fragment_m if fragments else config.thickest_m
+    slender = radius_px[kept] * pixel_m <= thickest_m
+    kept, pixel_m, has = kept[slender], pixel_m[slender], has[slender]
     depth_m = 1.0 / np.where(has, disparity[slender], 1.0)
     points = view.intrinsics.back_project(u[slender].ravel(), v[slender].ravel(), depth_m.ravel())
     points = points.reshape(*has.shape, 3)
-    profile.shift_away(points, counts[kept], config.centre_shift * radius_m)
+    profile.shift_away(points, counts[kept], config.centre_shift * radius_px[kept] * pixel_m)
     in_base = transform_points(view.base_from_camera, points.reshape(-1, 3)).reshape(points.shape)
-    return kept, radius_m, in_base
+    return kept, pixel_m, in_base
+
+
+def _radii_px(measured: FloatArray, said: FloatArray, *, fragments: bool) -> FloatArray:
+    """Return the radii (R,) of regions from those of their pixels and those a network says.
+
+    A fragment is seldom as wide as the wood it belongs to, so there the network's count. Otherwise
+    the rim of what a network found is right to a pixel and its radius to 15 percent.
+    """
+    if fragments:
+        return np.where(np.isnan(said), measured, said)
+    trust = (said / _RIM_PX) ** 2
+    trust /= trust + 1.0 / _RADIUS_SHARE**2
+    return np.where(np.isnan(said), measured, measured**trust * said ** (1.0 - trust))
 
 
 def half_width_px(quality: FloatArray) -> FloatArray:

@@ -16,7 +16,8 @@ class BranchMask:
     """One branch instance: a slender, piecewise straight region of the colour image.
 
     instance: its number in the view (1, 2, …). mask: (h, w) bool, the region's bounding box, whose
-    upper left pixel is (left_px, top_px). confidence: the segmenter's score in (0, 1].
+    upper left pixel is (left_px, top_px). confidence: the segmenter's score in (0, 1]. radius_px:
+    half its width as the segmenter measured it by more than the mask, None if it did not.
     """
 
     instance: int
@@ -24,6 +25,7 @@ class BranchMask:
     top_px: int
     mask: BoolArray
     confidence: float
+    radius_px: float | None = None
 
 
 class Segmenter(Protocol):
@@ -62,6 +64,11 @@ def require_masks(view: View, masks: Sequence[BranchMask]) -> None:
             raise ViewError(
                 f"{name} has a confidence of {mask.confidence}; its segmenter must give one from 0"
                 " to 1"
+            )
+        if mask.radius_px is not None and not 0.0 < mask.radius_px < np.inf:
+            raise ViewError(
+                f"{name} has a radius of {mask.radius_px} px; its segmenter must give one above 0,"
+                " or None"
             )
 
 

@@ -11,6 +11,7 @@ from canopy_skel.frame import Float32Array, UInt8Array, View
 from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels import colours
 from canopy_skel.pieces import Regions, depth_of
+from canopy_skel.segmenters.unet.targets import STRIDE
 from canopy_skel.woodpixels import MOST_LOGIT, PixelModel, hints_of, lab_of, layers_of
 
 _SPREAD = 4
@@ -152,10 +153,11 @@ def fragments_of(probability: Float32Array, maps: Float32Array, config: Fragment
     start = np.concatenate([[0], np.cumsum(sizes)])
     row = (v + 0.5) * maps.shape[1] / probability.shape[0]
     column = (u + 0.5) * maps.shape[2] / probability.shape[1]
-    cells = maps[:4, row.astype(np.int64), column.astype(np.int64)]
+    cells = maps[:5, row.astype(np.int64), column.astype(np.int64)]
     branch, centre = np.clip(cells[:2], -MOST_LOGIT, MOST_LOGIT)
-    each = np.column_stack([probability[v, u], *cells[2:], branch, centre]).astype(np.float64)
-    mean, highest = np.zeros((0, 5)), np.zeros(0)
+    columns = [probability[v, u], *cells[2:4], branch, centre, cells[4]]
+    each = np.column_stack(columns).astype(np.float64)
+    mean, highest = np.zeros((0, 6)), np.zeros(0)
     if len(sizes):
         mean = np.add.reduceat(each, start[:-1], axis=0) / sizes[:, None]
         highest = np.maximum.reduceat(each[:, 4], start[:-1])
@@ -165,7 +167,8 @@ def fragments_of(probability: Float32Array, maps: Float32Array, config: Fragment
         start=start,
         confidence=mean[:, 0],
         numbers=np.zeros(len(sizes), np.int64),
-        said=np.column_stack([mean[:, 1:], highest]),
+        said=np.column_stack([mean[:, 1:5], highest]),
+        radius_px=np.exp(mean[:, 5]) * (probability.shape[1] / maps.shape[2] / STRIDE),
     )
 
 

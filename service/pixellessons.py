@@ -1,7 +1,7 @@
 """Recordings with truth, made ready to fit the model of wood pixels to."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +82,8 @@ def _truth(truth: SkeletonDocument) -> tuple[cKDTree, FloatArray]:
 
 def _pixels(view: View, finder: WithMaps, tree: cKDTree, radius_m: FloatArray) -> Pixels:
     settings = CanopyConfig()
+    # From what is never asked, too: it shows best what wood does not look like.
+    everywhere = replace(settings.fragments, min_logit_around=-np.inf)
     depth_m = depth_of(view)
     masks, maps = finder.segment_and_map(view)
     covered = mask_image(view, regions_of_masks(masks))
@@ -89,7 +91,7 @@ def _pixels(view: View, finder: WithMaps, tree: cKDTree, radius_m: FloatArray) -
     lab = lab_of(view)
     log_odds, mean_odds = colour_log_odds(view, lab, covered, settings.fragments)
     hints = hints_of(maps)
-    v, u = asked_pixels(mean_odds, hints, settings.fragments)
+    v, u = asked_pixels(mean_odds, hints, everywhere)
     surface = view.intrinsics.back_project(
         u.astype(np.float64), v.astype(np.float64), depth_m[v, u].astype(np.float64)
     )

@@ -19,6 +19,7 @@ from canopy_skel.segmenters.unet.grouping import (
     Grouping,
     Strands,
     candidates_of,
+    log_radius_of,
     surplus_of,
 )
 from canopy_skel.segmenters.unet.network import Known
@@ -80,12 +81,13 @@ def _masks(
 ) -> list[BranchMask]:
     """Return masks of all candidates, numbered from 1; a mask may be empty and is left out then."""
     masks: list[BranchMask] = []
-    surplus, ones = surplus_of(known.maps, grouping), np.ones(len(candidates.cells))
+    surplus, log_radius = surplus_of(known.maps, grouping), log_radius_of(known.maps)
+    ones = np.ones(len(candidates.cells))
     for way in np.unique(candidates.way).tolist():
         label = np.zeros(candidates.size, dtype=np.int32)
         for number in np.flatnonzero(candidates.way == way).tolist():
             label.ravel()[candidates.cells[number]] = number + 1
-        strands = Strands(label=label, surplus=surplus)
+        strands = Strands(label=label, surplus=surplus, log_radius=log_radius)
         masks += masks_of(strands, ones, picture.ignore.shape[:2], least_score=0.0)
     return masks
 

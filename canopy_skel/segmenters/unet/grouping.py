@@ -66,10 +66,12 @@ class Strands:
     """Instances on the network's grid.
 
     label: (h, w) int32, 0 = none. surplus: (h, w), how far the branch logit is above the outline's.
+    log_radius: (h, w), of the radius in cells.
     """
 
     label: strands.I32
     surplus: Float32Array
+    log_radius: Float32Array
 
 
 def candidates_of(maps: Float32Array, grouping: Grouping) -> Candidates:
@@ -111,13 +113,22 @@ def chosen(
             continue
         taken.append(float(scores[place]))
         label[free] = len(taken)
-    strands_ = Strands(label=label.reshape(candidates.size), surplus=surplus_of(maps, grouping))
+    strands_ = Strands(
+        label=label.reshape(candidates.size),
+        surplus=surplus_of(maps, grouping),
+        log_radius=log_radius_of(maps),
+    )
     return strands_, np.array(taken)
 
 
 def surplus_of(maps: Float32Array, grouping: Grouping) -> Float32Array:
     """Return how far the branch logit is above the outline's, (h, w)."""
     return np.asarray(maps[0] - np.float32(_logit(grouping.outline)), dtype=np.float32)
+
+
+def log_radius_of(maps: Float32Array) -> Float32Array:
+    """Return the logarithm of the radius in cells, (h, w)."""
+    return np.asarray(maps[4] - np.float32(np.log(STRIDE)), dtype=np.float32)
 
 
 def _strands(

@@ -145,7 +145,7 @@ def masks_of(
     """Return the instances of at least a score at the picture's own size (height, width).
 
     They keep their numbers in `strands`. Their outlines run where the branch map, interpolated
-    between cells, falls to its threshold.
+    between cells, falls to its threshold; how thick they are says the map of radii.
     """
     masks: list[BranchMask] = []
     cell_px = np.array(size) / strands.label.shape
@@ -163,6 +163,7 @@ def masks_of(
         mask &= cv2.remap(strands.surplus, u, v, cv2.INTER_LINEAR, borderMode=rim) > 0
         top, left = int(pixels[0][0]), int(pixels[1][0])
         if mask.any():
+            log_radius = strands.log_radius[box][strands.label[box] == number].mean()
             masks.append(
                 BranchMask(
                     instance=number,
@@ -170,6 +171,7 @@ def masks_of(
                     top_px=top,
                     mask=mask,
                     confidence=float(scores[number - 1]),
+                    radius_px=float(np.exp(log_radius) * cell_px.mean()),
                 )
             )
     return masks

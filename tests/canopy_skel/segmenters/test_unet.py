@@ -134,6 +134,7 @@ def test_an_instance_that_fills_the_picture_covers_all_of_any_size():
         strands = Strands(
             label=np.ones((grid, grid), np.int32),
             surplus=np.ones((grid, grid), np.float32),
+            log_radius=np.zeros((grid, grid), np.float32),
         )
         (mask,) = masks_of(strands, np.ones(1), (size, size), least_score=0.0)
         assert (mask.top_px, mask.left_px, mask.mask.shape) == (0, 0, (size, size))
@@ -149,7 +150,8 @@ def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
     label[:, 2:middle], label[:, middle:-2] = 1, 2
     surplus = np.ones(grid, np.float32)
     surplus[: grid[0] // 2] = -1
-    strands = Strands(label=label, surplus=surplus)
+    log_radius = np.where(label == 1, np.float32(np.log(3.0)), np.float32(np.log(5.0)))
+    strands = Strands(label=label, surplus=surplus, log_radius=log_radius)
     masks = masks_of(strands, np.array([0.4, 0.9]), (height, width), least_score=0.0)
     shown = np.zeros((height, width), int)
     for mask in masks:
@@ -158,6 +160,7 @@ def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
         assert shown[box].shape == mask.mask.shape
         shown[box] += mask.mask
     cell_px = np.array([height, width]) / grid
+    assert [mask.radius_px for mask in masks] == pytest.approx([3, 5] * cell_px.mean())
     v, u = np.mgrid[:height, :width] + 0.5
     inside = (u > 2 * cell_px[1]) & (u < (grid[1] - 2) * cell_px[1])
     edge = abs(v - (grid[0] // 2) * cell_px[0]) < 1
