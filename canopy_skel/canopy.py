@@ -18,22 +18,24 @@ from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, count_
 from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
-from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
 from canopy_skel.kernels import agree
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
-from canopy_skel.observe import Observation, observe
+from canopy_skel.observe import Observation, moved, observe
 from canopy_skel.pieces import PieceConfig
 from canopy_skel.poses import (
     LoneView,
     PoseConfig,
     PoseCorrection,
     corrected,
+    found_again,
     lone_views,
     pose_corrections,
 )
 from canopy_skel.segment import BranchMask
 from canopy_skel.slivers import inside_thicker, on_axis
+from canopy_skel.spline import BranchSpline
 from canopy_skel.wood import FragmentConfig
 from canopy_skel.woodpixels import PixelModel
 
@@ -156,8 +158,8 @@ class CanopyScan:
             np.concatenate([np.zeros((0, POINT_FEATURES)), *features]),
         )
 
-    def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
-        """Return the fused forest of what was seen, and which views were moved for it."""
+    def believed(self, models: Models) -> Observations:
+        """Return the observed points that are probably wood, strips of trunks on their axes."""
         points, directions, radius_m, fragment, view, features = self.points()
         probability = np.empty(len(points))
         probability[fragment] = models.fragment_point(features[fragment])
@@ -172,13 +174,64 @@ class CanopyScan:
             fragment=fragment,
         ).chosen(probability >= limit)
         seen = on_axis(seen)
-        seen = seen.chosen(~inside_thicker(seen))
+        return seen.chosen(~inside_thicker(seen))
+
+    def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
+        """Return the fused forest of what was seen, and which views were moved for it."""
+        seen = self.believed(models)
         fused = fuse(seen, self.config.fusion)
         corrections = pose_corrections(seen, fused, self.config.poses)
         if corrections:
             seen = replace(seen, points_in_base=corrected(seen, corrections))
             fused = fuse(seen, self.config.fusion)
         return fused, corrections
+
+    def brought_back(self, models: Models) -> tuple["CanopyScan", list[PoseCorrection]]:
+        """Return the scan with its lone views where the other views show their wood.
+
+        And how they were moved. The scan itself, if there are none that fit anywhere.
+        """
+        alone = self.lone_views()
+        if not alone:
+            return self, []
+        seen = self.believed(models)
+        others = seen.chosen(~np.isin(seen.view, [one.view for one in alone]))
+        fused = fuse(others, self.config.fusion)
+        order, scan, corrections = sorted(self._seen), self, []
+        for one in alone:
+            index = order[one.view]
+            view = self._seen[index]
+            points, ways = (a[~view.fragment] for a in (view.points_in_base, view.directions))
+            motion, after_m = found_again(points, ways, fused, self.config.poses)
+            there = scan._with(index, moved(view, motion))
+            if one.view in {still.view for still in there.lone_views()}:
+                continue
+            scan = there
+            ways_m = np.linalg.norm(transform_points(motion, points) - points, axis=1)
+            corrections.append(
+                PoseCorrection(
+                    view=one.view,
+                    moved=motion,
+                    before_m=float(ways_m.mean()),
+                    after_m=after_m,
+                    brought_back=True,
+                )
+            )
+        return scan, corrections
+
+    def _with(self, index: int, seen: Observation) -> "CanopyScan":
+        """Return a scan in which a view has seen something else."""
+        scan = CanopyScan(self.config, self._pixel_model)
+        scan._seen = dict(self._seen)
+        for mine, its in ((self._counts, scan._counts), (self._agreed, scan._agreed)):
+            its.update({other: values.copy() for other, values in mine.items()})
+        scan.remove(index)
+        scan.add(index, seen)
+        return scan
+
+    def splines(self) -> list[list[BranchSpline]]:
+        """Return the instances of each view as polylines, in the order of the views' numbers."""
+        return [self._seen[index].splines for index in sorted(self._seen)]
 
     def lone_views(self) -> list[LoneView]:
         """Return the views that hardly any other agrees with."""

@@ -56,6 +56,14 @@ class RejectedView:
     reason: str
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MovedView:
+    """A view whose reported pose was centimetres off, and how far its wood was moved."""
+
+    index: int
+    by_m: float
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class SkeletonDocument:
     """A rooted forest in the base frame, metres.
@@ -63,8 +71,8 @@ class SkeletonDocument:
     position: (V, 3); radius, confidence: (V,); occluded: (V,) bool; edges: (E, 2), acyclic,
     partitioned by `branches`, parents before children. root: vertex the main tree grows from,
     None where there is no vertex. preview: joined by a spanning tree, ahead of the search.
-    extra: further per-vertex arrays of the JSON by name, e.g.
-    `segmented` in ground truth.
+    views_alone: indices of views that agree with no other, wherever they are moved. extra: further
+    per-vertex arrays of the JSON by name, e.g. `segmented` in ground truth.
     """
 
     scan_id: str
@@ -81,6 +89,8 @@ class SkeletonDocument:
     root: int | None
     components: int
     preview: bool = False
+    views_moved: tuple[MovedView, ...] = ()
+    views_alone: tuple[int, ...] = ()
     extra: dict[str, tuple[object, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -104,6 +114,8 @@ def build_document(
     method: Method,
     views_used: int,
     views_rejected: Iterable[RejectedView] = (),
+    views_moved: Iterable[MovedView] = (),
+    views_alone: Iterable[int] = (),
     preview: bool = False,
 ) -> SkeletonDocument:
     """Round a skeleton to 0.01 mm, root it, cut it into branches and number its vertices anew.
@@ -121,6 +133,8 @@ def build_document(
         method=method,
         views_used=views_used,
         views_rejected=tuple(views_rejected),
+        views_moved=tuple(views_moved),
+        views_alone=tuple(views_alone),
         position=tree.vertices_in_base,
         radius=tree.radius_m,
         occluded=tree.occluded,
@@ -148,6 +162,7 @@ def to_json(document: SkeletonDocument) -> bytes:
         "views": {
             "used": document.views_used,
             "rejected": [{"index": v.index, "reason": v.reason} for v in document.views_rejected],
+            **_doubts(document),
         },
         "vertices": {
             "position": _rounded_array(document.position, _METRE_DECIMALS).tolist(),
@@ -169,6 +184,18 @@ def to_json(document: SkeletonDocument) -> bytes:
     return ("{" + ",\n ".join(lines) + "}\n").encode()
 
 
+def _doubts(document: SkeletonDocument) -> dict[str, object]:
+    """Return which views were not where they were said to be, if any."""
+    doubts: dict[str, object] = {}
+    if document.views_moved:
+        doubts["moved"] = [
+            {"index": v.index, "by_m": round(v.by_m, _METRE_DECIMALS)} for v in document.views_moved
+        ]
+    if document.views_alone:
+        doubts["alone"] = list(document.views_alone)
+    return doubts
+
+
 def from_json(data: bytes, source: str = "skeleton document") -> SkeletonDocument:
     """Read a document; `source` is the file or topic to name when it is wrong.
 
@@ -184,6 +211,8 @@ def from_json(data: bytes, source: str = "skeleton document") -> SkeletonDocumen
         method=Method(**value["method"]),
         views_used=views["used"],
         views_rejected=tuple(RejectedView(**rejected) for rejected in views["rejected"]),
+        views_moved=tuple(MovedView(**moved) for moved in views.get("moved", ())),
+        views_alone=tuple(views.get("alone", ())),
         position=np.array(vertices.pop("position"), dtype=np.float64).reshape(-1, 3),
         radius=np.array(vertices.pop("radius"), dtype=np.float64),
         occluded=np.array(vertices.pop("occluded"), dtype=np.bool_),

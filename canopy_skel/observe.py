@@ -1,12 +1,12 @@
 """One view in mode `canopy`: points on the wood it shows, and what it says of other points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from canopy_skel.evidence import ViewEvidence, evidence_of
 from canopy_skel.frame import Float32Array, View
-from canopy_skel.geometry import BoolArray, FloatArray, IntArray
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray, invert, transform_points
 from canopy_skel.kernels import agree, fuse, profile
 from canopy_skel.pieces import (
     Piece,
@@ -72,6 +72,31 @@ class Observation:
             _NEAR_M,
             _MIN_COSINE,
         )
+
+
+def moved(seen: Observation, motion: FloatArray) -> Observation:
+    """Return what the view would have shown, had its camera stood elsewhere by a motion (4, 4)."""
+    points = transform_points(motion, seen.points_in_base)
+    cells = fuse.cell_keys(points, _NEAR_M)
+    by_cell = np.argsort(cells, kind="stable")
+    return replace(
+        seen,
+        splines=[
+            replace(
+                spline,
+                control_points_in_base=transform_points(motion, spline.control_points_in_base),
+            )
+            for spline in seen.splines
+        ],
+        points_in_base=points,
+        directions=np.ascontiguousarray(seen.directions @ motion[:3, :3].T),
+        evidence=replace(
+            seen.evidence,
+            camera_from_base=np.ascontiguousarray(seen.evidence.camera_from_base @ invert(motion)),
+        ),
+        cells=cells[by_cell],
+        by_cell=by_cell,
+    )
 
 
 def observe(

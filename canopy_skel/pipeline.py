@@ -22,7 +22,7 @@ from canopy_skel.graph import SkeletonGraph
 from canopy_skel.initial import InitialConfig, initial_skeleton
 from canopy_skel.likelihood import LikelihoodConfig, LikelihoodMap, segments_of
 from canopy_skel.pathsearch import Join, PathSearch, add_paths, straighten_predicted
-from canopy_skel.poses import LoneView, PoseCorrection
+from canopy_skel.poses import LoneView, PoseCorrection, one_after_other
 from canopy_skel.segment import Segmenter, require_masks
 from canopy_skel.segmenters.mapping import WithMaps
 from canopy_skel.segmenters.recorded import RecordedSegmenter
@@ -349,12 +349,20 @@ class Skeletonizer:
     def _canopy_skeleton(self) -> Extraction:
         matched = any(known.matched for known in self._known.values())
         models = self._models["stereo" if matched else "camera"]
-        joined = skeleton_of(self._canopy, self._map, models)
+        scan, brought = self._canopy.brought_back(models)
+        likelihood = self._map if scan is self._canopy else self._map_of(scan.splines())
+        joined = skeleton_of(scan, likelihood, models)
         return Extraction(
             graph=joined.graph,
-            voxels=self._map.occupied(),
+            voxels=likelihood.occupied(),
             observed_components=joined.observed_components,
             joins=(),
-            corrections=joined.corrections,
+            corrections=tuple(one_after_other(brought, joined.corrections)),
             lone_views=joined.lone_views,
         )
+
+    def _map_of(self, splines: list[list[BranchSpline]]) -> LikelihoodMap:
+        likelihood = LikelihoodMap(self._config.likelihood, self._memory_limit_bytes)
+        for of_view in splines:
+            likelihood.add(segments_of(of_view))
+        return likelihood

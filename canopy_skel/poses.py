@@ -1,5 +1,6 @@
 """Where a view disagrees with all views together, its pose is off: measure it, and mend it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from canopy_skel.kernels import aligning, fuse
 
 _MIN_COSINE = 0.9
 _FEWEST_VIEWS, _FEWEST_POINTS, _ALONE = 3, 100, 0.5
+_SEARCH_M, _STEP_M, _SAMPLE, _TRIES = 0.08, 0.02, 300, 4
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,13 +36,15 @@ class PoseCorrection:
     """A view that was moved: its place among those that are in, and by what.
 
     moved: (4, 4), maps points of the view as reported to where they belong, in base. before_m,
-    after_m: median distance of its wood from the fused skeleton, across it.
+    after_m: median distance of its wood from the fused skeleton, across it. brought_back: it was
+    too far off for that (see `found_again`); before_m is how far its wood was moved, on the mean.
     """
 
     view: int
     moved: FloatArray
     before_m: float
     after_m: float
+    brought_back: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -91,6 +95,50 @@ def pose_corrections(
     return found
 
 
+def found_again(
+    points: FloatArray, directions: FloatArray, others: Observed, config: PoseConfig
+) -> tuple[FloatArray, float]:
+    """Return the rigid motion (4, 4) that takes a lone view's wood onto what other views show.
+
+    points, directions: (N, 3), of its instances. others: fused without it. Shifts of up to 8 cm
+    along each axis are tried, the least of those first that as many points agree with; from the
+    best of them the view is aligned as others are. Also returns the median distance across the
+    wood then, infinite if too little of it fits.
+    """
+    fine, coarse = _lines(others, _STEP_M), _lines(others, config.reach_m)
+    some = np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(np.int64)
+    steps = np.arange(-_SEARCH_M, _SEARCH_M + _STEP_M / 2, _STEP_M)
+    shifts = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
+    fits = [len(_near(points[some] + shift, directions[some], fine)[0]) for shift in shifts]
+    moved, after_m = np.eye(4), np.inf
+    moved[:3, 3] = shifts[int(np.argmax(fits))]
+    for _ in range(_TRIES):
+        here, ways = transform_points(moved, points), directions @ moved[:3, :3].T
+        closer, _, after_m = _aligned(here, ways, coarse, config)
+        moved = closer @ moved
+    return moved, after_m
+
+
+def one_after_other(
+    first: Sequence[PoseCorrection], then: Sequence[PoseCorrection]
+) -> list[PoseCorrection]:
+    """Return corrections as one per view, of views that were moved and then moved again."""
+    both = {one.view: one for one in first}
+    for one in then:
+        before = both.get(one.view)
+        both[one.view] = one
+        if before is not None:
+            both[one.view] = PoseCorrection(
+                view=one.view,
+                moved=one.moved @ before.moved,
+                before_m=before.before_m,
+                after_m=one.after_m,
+                brought_back=True,
+            )
+    return [both[view] for view in sorted(both)]
+
+
 def corrected(seen: Observations, corrections: list[PoseCorrection]) -> FloatArray:
     """Return the positions (N, 3) of the points with the views moved."""
     points = seen.points_in_base.copy()
@@ -107,6 +155,7 @@ class _Lines:
     points: FloatArray
     directions: FloatArray
     keys: IntArray
+    cell_m: float
 
 
 def _lines(fused: Observed, cell_m: float) -> _Lines:
@@ -116,6 +165,22 @@ def _lines(fused: Observed, cell_m: float) -> _Lines:
         points=fused.vertices_in_base[order],
         directions=fused.directions[order],
         keys=keys[order],
+        cell_m=cell_m,
+    )
+
+
+def _near(
+    points: FloatArray, directions: FloatArray, lines: _Lines
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return which points lie along a vertex within the cells' size; see `aligning.offsets`."""
+    return aligning.offsets(
+        points,
+        np.ascontiguousarray(directions),
+        lines.points,
+        lines.directions,
+        lines.keys,
+        lines.cell_m,
+        _MIN_COSINE,
     )
 
 
@@ -129,15 +194,7 @@ def _aligned(
     moved, here = np.eye(4), points
     before_m = after_m = 0.0
     for step in range(config.rounds + 1):
-        near, index, off = aligning.offsets(
-            here,
-            directions,
-            lines.points,
-            lines.directions,
-            lines.keys,
-            config.reach_m,
-            _MIN_COSINE,
-        )
+        near, index, off = _near(here, directions, lines)
         if len(near) < config.min_points:
             return np.eye(4), before_m, np.inf
         off_m = np.linalg.norm(off, axis=1)

@@ -207,11 +207,17 @@ def _add(walk: _Walk, view: View | RejectedView, stopwatch: Stopwatch) -> None:
 
 
 def _doubts(path: Path, skeletonizer: Skeletonizer, extraction: Extraction) -> list[str]:
-    """Return which views are probably centimetres off."""
-    return [
+    """Return which views were not where they were said to be, or agree with no other."""
+    moved = [
+        f"{path.name}: view {skeletonizer.views[one.view]}: its pose is {100 * one.before_m:.0f} cm"
+        " off, or the tree moved: taken to where the other views show its wood"
+        for one in extraction.corrections
+        if one.brought_back
+    ]
+    return moved + [
         f"{path.name}: view {skeletonizer.views[one.view]}: only {one.along:.0%} of its wood lies"
-        f" along that of other views (usually {one.usual:.0%}): its pose is centimetres off, or the"
-        " tree moved; the skeleton has it twice, so record it anew"
+        f" along that of other views (usually {one.usual:.0%}), wherever it is moved: its pose is"
+        " wrong, or it shows another tree; what it shows is in the skeleton, so record it anew"
         for one in extraction.lone_views
     ]
 

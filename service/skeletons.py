@@ -4,7 +4,13 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from importlib.metadata import version
 
-from canopy_skel.document import Method, RejectedView, SkeletonDocument, build_document
+from canopy_skel.document import (
+    Method,
+    MovedView,
+    RejectedView,
+    SkeletonDocument,
+    build_document,
+)
 from canopy_skel.pipeline import Extraction, Skeletonizer
 from canopy_skel.segment import Segmenter
 from service.segmenters import make_segmenter
@@ -37,5 +43,11 @@ def document_of(
         ),
         views_used=used,
         views_rejected=sorted(rejected, key=lambda view: view.index),
+        views_moved=[
+            MovedView(index=skeletonizer.views[one.view], by_m=one.before_m)
+            for one in extraction.corrections
+            if one.brought_back
+        ],
+        views_alone=[skeletonizer.views[one.view] for one in extraction.lone_views],
         preview=extraction.preview,
     )
