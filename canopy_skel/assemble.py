@@ -79,7 +79,7 @@ def _observed_graph(parts: Parts, observed: Observed) -> SkeletonGraph:
     return SkeletonGraph(
         vertices_in_base=parts.points,
         edges=observed.edges,
-        radius_m=parts.radius_m,
+        radius_m=parts.probable_radius_m,
         occluded=np.zeros(len(source), dtype=np.bool_),
         confidence=parts.confidence,
         source=source.astype(np.int64),

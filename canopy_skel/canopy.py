@@ -169,12 +169,18 @@ class CanopyScan:
             points_in_base=points,
             directions=directions,
             radius_m=radius_m,
+            probable_radius_m=self._probable_radii(),
             probability=probability,
             view=view,
             fragment=fragment,
         ).chosen(probability >= limit)
         seen = on_axis(seen)
         return seen.chosen(~inside_thicker(seen))
+
+    def _probable_radii(self) -> FloatArray:
+        """Return how thick the wood at all points probably is (N,), in the order of `points`."""
+        order = sorted(self._seen)
+        return np.concatenate([np.zeros(0), *(self._seen[i].probable_radius_m for i in order)])
 
     def observed(self, models: Models) -> tuple[Observed, list[PoseCorrection]]:
         """Return the fused forest of what was seen, and which views were moved for it."""
@@ -258,6 +264,7 @@ class CanopyScan:
                 length_m=length_m,
                 confidence=models.vertex(vertex_features(observed, length_m)),
                 radius_m=observed.support[:, 1],
+                probable_radius_m=observed.support[:, 6],
                 fragment=observed.support[:, 5] < 0.5,
                 ends=find_ends(observed.vertices_in_base, observed.directions, observed.edges),
             ),
@@ -309,7 +316,7 @@ def piece_means(values: FloatArray, piece: IntArray) -> FloatArray:
 
 def vertex_features(observed: Observed, length_m: FloatArray) -> FloatArray:
     """Return what speaks for each fused vertex (V, 7)."""
-    weight, radius_m, mean_p, largest_p, views, masks = observed.support.T
+    weight, radius_m, mean_p, largest_p, views, masks, _ = observed.support.T
     return np.column_stack(
         [
             np.log(np.maximum(views, 1)),

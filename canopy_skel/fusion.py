@@ -48,13 +48,15 @@ class FusionConfig:
 class Observations:
     """Points on observed wood, in canonical order.
 
-    points_in_base, directions: (N, 3), unit. radius_m, probability (to be wood): (N,). view: (N,),
-    its place among those that are in. fragment: (N,), a fragment showed it and not an instance.
+    points_in_base, directions: (N, 3), unit. radius_m, of the pixels, probable_radius_m, what the
+    wood has, probability (to be wood): (N,). view: (N,), its place among those that are in.
+    fragment: (N,), a fragment showed it and not an instance.
     """
 
     points_in_base: FloatArray
     directions: FloatArray
     radius_m: FloatArray
+    probable_radius_m: FloatArray
     probability: FloatArray
     view: IntArray
     fragment: BoolArray
@@ -65,6 +67,7 @@ class Observations:
             points_in_base=self.points_in_base[stay],
             directions=self.directions[stay],
             radius_m=self.radius_m[stay],
+            probable_radius_m=self.probable_radius_m[stay],
             probability=self.probability[stay],
             view=self.view[stay],
             fragment=self.fragment[stay],
@@ -73,9 +76,10 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Observed:
-    """The observed forest: vertices (V, 3), directions (V, 3), support (V, 6), edges (E, 2).
+    """The observed forest: vertices (V, 3), directions (V, 3), support (V, 7), edges (E, 2).
 
-    support: total weight, radius, mean and largest probability, views, share from instances.
+    support: total weight, radius, mean and largest probability, views, share from instances,
+    probable radius.
     """
 
     vertices_in_base: FloatArray
@@ -124,6 +128,7 @@ def _drawn(seen: Observations, config: FusionConfig) -> tuple[FloatArray, FloatA
         seen.points_in_base[order],
         seen.directions[order],
         seen.radius_m[order],
+        seen.probable_radius_m[order],
         weight[order],
         seen.probability[order],
         np.left_shift(1, seen.view[order] % _BITS),

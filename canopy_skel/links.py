@@ -69,7 +69,8 @@ class Parts:
     """What is to be joined.
 
     points, directions: (V, 3). component: (V,). length_m: (V,), of the component. confidence,
-    radius_m, fragment (seen more in fragments than in instances): (V,). ends: the free ends.
+    radius_m (of the pixels, which is what the models know), probable_radius_m (what the wood has),
+    fragment (seen more in fragments than in instances): (V,). ends: the free ends.
     """
 
     points: FloatArray
@@ -78,6 +79,7 @@ class Parts:
     length_m: FloatArray
     confidence: FloatArray
     radius_m: FloatArray
+    probable_radius_m: FloatArray
     fragment: BoolArray
     ends: Ends
 

@@ -37,7 +37,8 @@ class Observation:
 
     splines: the instances as polylines. fragments: how many pieces there are beside them. dropped:
     instances without enough depth. points_in_base, directions: (N, 3), along the pieces; piece:
-    (N,), which of them, ascending; radius_m, fragment: (N,); quality: (N, 12), see `_quality`.
+    (N,), which of them, ascending; radius_m: (N,), of the pixels, probable_radius_m: what the wood
+    has, see `Piece`; fragment: (N,); quality: (N, 12), see `_quality`.
     evidence: the view, ready to be asked. cells: (N,) cell numbers ascending, of the points in the
     order `by_cell` (N,).
     """
@@ -49,6 +50,7 @@ class Observation:
     directions: FloatArray
     piece: IntArray
     radius_m: FloatArray
+    probable_radius_m: FloatArray
     fragment: BoolArray
     quality: FloatArray
     evidence: ViewEvidence
@@ -138,6 +140,7 @@ def observe(
         directions=directions,
         piece=of,
         radius_m=np.array([p.spline.radius_m for p in pieces])[of],
+        probable_radius_m=np.array([p.radius_m for p in pieces])[of],
         fragment=np.array([p.fragment for p in pieces], dtype=np.bool_)[of],
         quality=_quality(pieces)[of],
         evidence=evidence_of(view, wood),

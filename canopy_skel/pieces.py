@@ -86,11 +86,13 @@ class Piece:
 
     quality: (6,) pixels, length_px, width_px, share of pixels with depth, share of these on the
     profile, lateral deviation over width. said: (5,), see `Regions`. pixel_m: how much wood a pixel
-    shows there.
+    shows there. radius_m: what the wood probably has, by its pixels and what a network says; the
+    radius of the spline is that of the pixels.
     """
 
     spline: BranchSpline
     fragment: bool
+    radius_m: float
     pixel_m: float
     quality: FloatArray
     said: FloatArray
@@ -139,18 +141,20 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         config.min_valid_share,
         min(_LEAST_DISPARITY, 0.5 / config.farthest_m),
     )
-    radius_px = _radii_px(half_width_px(quality), regions.radius_px, fragments=fragments)
-    kept, pixel_m, points = _lifted(view, counts, knots, radius_px, config, fragments=fragments)
+    measured_px = half_width_px(quality)
+    probable_px = _probable_px(measured_px, regions.radius_px, fragments=fragments)
+    kept, pixel_m, points = _lifted(view, counts, knots, measured_px, config, fragments=fragments)
     return [
         Piece(
             spline=BranchSpline(
                 view_index=view.index,
                 instance=int(regions.numbers[i]),
                 confidence=float(regions.confidence[i]),
-                radius_m=radius_px[i] * pixel,
+                radius_m=float(measured_px[i]) * pixel,
                 control_points_in_base=line[: counts[i]],
             ),
             fragment=fragments,
+            radius_m=float(probable_px[i]) * pixel,
             pixel_m=pixel,
             quality=quality[i],
             said=regions.said[i],
@@ -185,7 +189,7 @@ def _lifted(
     return kept, pixel_m, in_base
 
 
-def _radii_px(measured: FloatArray, said: FloatArray, *, fragments: bool) -> FloatArray:
+def _probable_px(measured: FloatArray, said: FloatArray, *, fragments: bool) -> FloatArray:
     """Return the radii (R,) of regions from those of their pixels and those a network says.
 
     A fragment is seldom as wide as the wood it belongs to, so there the network's count. Otherwise

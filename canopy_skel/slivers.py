@@ -65,11 +65,17 @@ def _moved(seen: Observations, thin: IntArray, sides: IntArray) -> Observations:
     thickness_m = np.sum(radius_m / away_m, axis=1) / np.sum(1.0 / away_m, axis=1)
     moves = np.linalg.norm(onto - points, axis=1) < _BARK_RADII * thickness_m
     moved = thin[moves]
-    place, direction, thick = (
-        array.copy() for array in (seen.points_in_base, seen.directions, seen.radius_m)
+    fields = (seen.points_in_base, seen.directions, seen.radius_m, seen.probable_radius_m)
+    place, direction, thick, probable = (array.copy() for array in fields)
+    place[moved], direction[moved] = onto[moves], axis[moves]
+    thick[moved] = probable[moved] = thickness_m[moves]
+    return replace(
+        seen,
+        points_in_base=place,
+        directions=direction,
+        radius_m=thick,
+        probable_radius_m=probable,
     )
-    place[moved], direction[moved], thick[moved] = onto[moves], axis[moves], thickness_m[moves]
-    return replace(seen, points_in_base=place, directions=direction, radius_m=thick)
 
 
 def inside_thicker(seen: Observations) -> BoolArray:

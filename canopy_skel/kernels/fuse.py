@@ -11,8 +11,9 @@ from canopy_skel.kernels.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-SUPPORT = 6
-"""Columns: total weight, radius, mean p, largest p, views, share of weight from instances."""
+SUPPORT = 7
+"""Columns: total weight, radius, mean p, largest p, views, share of weight from instances, probable
+radius."""
 
 
 @kernel("int64[::1](float64[:,::1], float64)")
@@ -108,8 +109,8 @@ def bits_in(number: int) -> int:
 
 @kernel(
     "UniTuple(float64[:,::1], 3)(float64[:,::1], float64[:,::1], float64[::1], float64[:,::1],"
-    " float64[:,::1], float64[::1], float64[::1], float64[::1], int64[::1], boolean[::1],"
-    " int64[::1], float64, float64, float64, float64)"
+    " float64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1], int64[::1],"
+    " boolean[::1], int64[::1], float64, float64, float64, float64)"
 )
 def shift_across(
     points: Floats,
@@ -118,6 +119,7 @@ def shift_across(
     references: Floats,
     reference_directions: Floats,
     reference_radii: Floats,
+    probable_radii: Floats,
     weights: Floats,
     probability: Floats,
     view_bits: Ints,
@@ -149,7 +151,7 @@ def shift_across(
             cosines,
         )  # fmt: skip
         total, bits = 0.0, 0
-        ox = oy = oz = ex = ey = ez = r = mean_p = masks = largest = 0.0
+        ox = oy = oz = ex = ey = ez = r = probable_r = mean_p = masks = largest = 0.0
         for n in range(count):
             j, weight = found[n], squared[n]
             signed = weight if cosines[n] > 0.0 else -weight
@@ -160,10 +162,12 @@ def shift_across(
             ey = ey + signed * reference_directions[j, 1]
             ez = ez + signed * reference_directions[j, 2]
             r, mean_p = r + weight * reference_radii[j], mean_p + weight * probability[j]
+            probable_r = probable_r + weight * probable_radii[j]
             largest, bits = max(largest, probability[j]), bits | view_bits[j]
         if draw((ox, oy, oz), (ex, ey, ez), total, moved[i], turned[i]):
             support[i, 0], support[i, 1], support[i, 2] = total, r / total, mean_p / total
             support[i, 3], support[i, 4], support[i, 5] = largest, bits_in(bits), masks / total
+            support[i, 6] = probable_r / total
     return moved, turned, support
 
 

@@ -78,6 +78,7 @@ def one_link(*, fragment=False, empty=0.0):
         length_m=np.full(2, 0.1),
         confidence=np.array([0.9, 0.8]),
         radius_m=np.full(2, 0.005),
+        probable_radius_m=np.full(2, 0.005),
         fragment=np.array([False, fragment]),
         ends=Ends(vertex=np.arange(2), tangents=along, behind_m=np.full(2, 0.1)),
     )

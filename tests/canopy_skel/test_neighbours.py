@@ -37,13 +37,13 @@ def test_points_move_to_the_mean_of_all_that_run_along_them(seed):
     points, directions, random = twigs(seed)
     order, keys = by_cell(points, CELL_M)
     references, ways = points[order], directions[order]
-    radii, weights = random.uniform(0.002, 0.06, (2, len(points)))
+    radii, probable, weights = random.uniform(0.002, 0.06, (3, len(points)))
     probability = random.uniform(0.5, 1, len(points))
     bits = 1 << random.integers(0, 5, len(points))
     fragment = random.random(len(points)) < 0.4
     moved, turned, support = kernel.shift_across(
-        points, directions, radii, references, ways, radii, weights, probability, bits, fragment,
-        keys, CELL_M, WIDTH_M, 0.5, MIN_COSINE,
+        points, directions, radii, references, ways, radii, probable, weights, probability, bits,
+        fragment, keys, CELL_M, WIDTH_M, 0.5, MIN_COSINE,
     )  # fmt: skip
     for i, (point, way) in enumerate(zip(points, directions, strict=True)):
         width = max(WIDTH_M, 0.5 * radii[i])
@@ -63,6 +63,7 @@ def test_points_move_to_the_mean_of_all_that_run_along_them(seed):
             probability[near].max(),
             int(np.bitwise_or.reduce(bits[near])).bit_count(),
             weight @ ~fragment[near] / weight.sum(),
+            weight @ probable[near] / weight.sum(),
         ]
         np.testing.assert_allclose(support[i], expected, rtol=1e-12)
 
@@ -141,7 +142,12 @@ def all_found(points, directions, random):
     radii, weights = random.uniform(0.002, 0.06, (2, len(points)))
     fragment, kept = random.random(len(points)) < 0.5, np.zeros(len(points), np.bool_)
     bits = np.ones(len(points), np.int64)
-    near = places, ways, *(one[order] for one in (radii, weights, weights, bits, fragment)), keys
+    near = (
+        places,
+        ways,
+        *(one[order] for one in (radii, radii, weights, weights, bits, fragment)),
+        keys,
+    )
     shifted = kernel.shift_across(points, directions, radii, *near, CELL_M, WIDTH_M, 0.5, 0.5)
     kept[order] = kernel.thinned(places, place, keys, CELL_M, 0.006)
     return {
@@ -186,6 +192,7 @@ def test_vertices_keep_the_order_of_the_points_that_gave_them():
         points_in_base=points,
         directions=directions,
         radius_m=np.full(len(points), 0.004),
+        probable_radius_m=np.full(len(points), 0.004),
         probability=np.full(len(points), 0.9),
         view=np.zeros(len(points), np.int64),
         fragment=np.zeros(len(points), np.bool_),

@@ -18,6 +18,7 @@ def with_strip(trunk, point, *, radius_m=0.015, direction=ALONG_X, fragment=Fals
         points_in_base=np.vstack([np.outer(trunk, ALONG_X), point]),
         directions=np.vstack([np.tile(ALONG_X, (count, 1)), direction]),
         radius_m=np.append(np.full(count, TRUNK_M), radius_m),
+        probable_radius_m=np.append(np.full(count, TRUNK_M), 1.1 * radius_m),
         probability=np.full(count + 1, 0.9),
         view=np.zeros(count + 1, dtype=np.int64),
         fragment=np.append(np.full(count, not of_masks), fragment),
@@ -57,7 +58,7 @@ def test_bark_between_places_where_the_trunk_is_seen_whole_moves_onto_its_axis(f
     moved = on_axis(seen)
     assert moved.points_in_base[-1] == pytest.approx([0.03, 0, 0], abs=1e-9)
     assert moved.directions[-1] == pytest.approx(way)
-    assert moved.radius_m[-1] == pytest.approx(TRUNK_M)
+    assert moved.radius_m[-1] == moved.probable_radius_m[-1] == pytest.approx(TRUNK_M)
     np.testing.assert_array_equal(moved.points_in_base[:-1], seen.points_in_base[:-1])
     np.testing.assert_array_equal(moved.radius_m[:-1], seen.radius_m[:-1])
 
@@ -117,6 +118,7 @@ def test_the_axis_is_found_wherever_the_tree_stands_and_leans(turn, shift, place
         points_in_base=rotation.apply(seen.points_in_base) + shift,
         directions=rotation.apply(seen.directions),
         radius_m=seen.radius_m,
+        probable_radius_m=seen.probable_radius_m,
         probability=seen.probability,
         view=seen.view,
         fragment=seen.fragment,
