@@ -19,7 +19,7 @@ from canopy_skel.spline import BranchSpline
 
 SAID = 5
 """Figures that a network says of a region, see `Regions`."""
-_RIM_PX, _RADIUS_SHARE = 1.0, 0.15
+_RIM_PX, _RADIUS_SHARE = 1.5, 0.15
 _LEAST_DISPARITY = 0.05
 """Per metre, or that of twice the farthest depth: a line that runs on to less is no wood's."""
 _MOST_KNOTS = 8
@@ -193,7 +193,7 @@ def _probable_px(measured: FloatArray, said: FloatArray, *, fragments: bool) -> 
     """Return the radii (R,) of regions from those of their pixels and those a network says.
 
     A fragment is seldom as wide as the wood it belongs to, so there the network's count. Otherwise
-    the rim of what a network found is right to a pixel and its radius to 15 percent.
+    the rim of what a network found is right to 1.5 pixels and its radius to 15 percent.
     """
     if fragments:
         return np.where(np.isnan(said), measured, said)

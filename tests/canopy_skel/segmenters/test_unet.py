@@ -160,7 +160,7 @@ def test_instances_are_outlined_in_the_picture_whatever_the_grid(zoom):
         assert shown[box].shape == mask.mask.shape
         shown[box] += mask.mask
     cell_px = np.array([height, width]) / grid
-    assert [mask.radius_px for mask in masks] == pytest.approx([3, 5] * cell_px.mean())
+    assert [mask.radius_px for mask in masks] == pytest.approx(cell_px.mean() * np.array([3, 5]))
     v, u = np.mgrid[:height, :width] + 0.5
     inside = (u > 2 * cell_px[1]) & (u < (grid[1] - 2) * cell_px[1])
     edge = abs(v - (grid[0] // 2) * cell_px[0]) < 1
