@@ -198,6 +198,38 @@ def test_pieces_run_along_the_axes_of_the_sticks():
         assert piece.spline.radius_m == pytest.approx(radius, rel=0.25)
 
 
+def test_what_a_network_says_of_the_radius_counts_for_more_the_thinner_the_wood():
+    thin, *_, thick = sorted(RecordedSegmenter().segment(PLAIN), key=lambda mask: mask.mask.sum())
+
+    def radii(mask):
+        regions = regions_of_masks([mask])
+        (piece,) = pieces_of(PLAIN, regions, PieceConfig(), fragments=False)
+        return piece.radius_m, piece.spline.radius_m, piece.pixel_m
+
+    shares = []
+    for mask in (thin, thick):
+        probable_m, measured_m, pixel_m = radii(mask)
+        assert probable_m == measured_m
+        half_m, still_measured_m, _ = radii(replace(mask, radius_px=0.5 * measured_m / pixel_m))
+        assert still_measured_m == measured_m
+        assert 0.5 * measured_m < half_m < measured_m
+        shares.append(np.log(half_m / measured_m) / np.log(0.5))
+    assert shares[0] > 0.7
+    assert shares[1] < shares[0]
+
+
+def test_fragments_are_as_thick_as_the_network_says():
+    probability = np.zeros((240, 320), np.float32)
+    probability[100:104, 60:100] = 0.9
+    maps = np.zeros((5, 60, 80), np.float32)
+    maps[4] = np.log(3.0)  # of a picture enlarged so that a cell, four pixels here, is two there
+    regions = fragments_of(probability, maps, FragmentConfig())
+    view = replace(PLAIN, depth_m=np.ones((240, 320), dtype=np.float32))
+    (piece,) = pieces_of(view, regions, PieceConfig(), fragments=True)
+    assert piece.radius_m == pytest.approx(6.0 / PLAIN.intrinsics.fx_px, rel=1e-3)
+    assert piece.spline.radius_m == pytest.approx(2.0 / PLAIN.intrinsics.fx_px, rel=0.1)
+
+
 def test_a_wall_is_no_branch():
     wall = np.zeros((240, 320), np.uint16)
     wall[60:180, 20:300] = 1
