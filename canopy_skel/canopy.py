@@ -18,7 +18,7 @@ from canopy_skel.evidence import BACKGROUND, HIDDEN, LEAF, THROUGH, WOOD, count_
 from canopy_skel.extend import ExtensionConfig
 from canopy_skel.frame import Float32Array, View
 from canopy_skel.fusion import FusionConfig, Observations, Observed, fuse
-from canopy_skel.geometry import BoolArray, FloatArray, IntArray, transform_points
+from canopy_skel.geometry import BoolArray, FloatArray, IntArray
 from canopy_skel.kernels import agree
 from canopy_skel.likelihood import LikelihoodMap
 from canopy_skel.links import LinkConfig, Parts
@@ -30,7 +30,9 @@ from canopy_skel.poses import (
     PoseCorrection,
     corrected,
     found_again,
+    is_found,
     lone_views,
+    one_after_other,
     pose_corrections,
 )
 from canopy_skel.segment import BranchMask
@@ -195,8 +197,18 @@ class CanopyScan:
     def brought_back(self, models: Models) -> tuple["CanopyScan", list[PoseCorrection]]:
         """Return the scan with its lone views where the other views show their wood.
 
-        And how they were moved. The scan itself, if there are none that fit anywhere.
+        And how they were moved. The scan itself, if there are none that fit anywhere. What comes
+        back shows more wood for others to fit to, so that they are asked again.
         """
+        scan, corrections = self, list[PoseCorrection]()
+        for _ in self._seen:
+            scan, found = scan._once_brought_back(models)
+            if not found:
+                break
+            corrections = one_after_other(corrections, found)
+        return scan, corrections
+
+    def _once_brought_back(self, models: Models) -> tuple["CanopyScan", list[PoseCorrection]]:
         alone = self.lone_views()
         if not alone:
             return self, []
@@ -208,21 +220,13 @@ class CanopyScan:
             index = order[one.view]
             view = self._seen[index]
             points, ways = (a[~view.fragment] for a in (view.points_in_base, view.directions))
-            motion, after_m = found_again(points, ways, fused, self.config.poses)
-            there = scan._with(index, moved(view, motion))
-            if one.view in {still.view for still in there.lone_views()}:
+            found = found_again(one.view, points, ways, fused, self.config.poses)
+            if found is None:
                 continue
-            scan = there
-            ways_m = np.linalg.norm(transform_points(motion, points) - points, axis=1)
-            corrections.append(
-                PoseCorrection(
-                    view=one.view,
-                    moved=motion,
-                    before_m=float(ways_m.mean()),
-                    after_m=after_m,
-                    brought_back=True,
-                )
-            )
+            there = scan._with(index, moved(view, found.moved))
+            if is_found(one, float(there.along_others()[0][one.view])):
+                scan = there
+                corrections.append(found)
         return scan, corrections
 
     def _with(self, index: int, seen: Observation) -> "CanopyScan":
@@ -241,6 +245,10 @@ class CanopyScan:
 
     def lone_views(self) -> list[LoneView]:
         """Return the views that hardly any other agrees with."""
+        return lone_views(*self.along_others())
+
+    def along_others(self) -> tuple[FloatArray, IntArray]:
+        """Return how much of each view's wood others show any along (V,), and its points (V,)."""
         order = sorted(self._seen)
         of_masks = [~self._seen[index].fragment for index in order]
         points = np.array([np.count_nonzero(chosen) for chosen in of_masks], dtype=np.int64)
@@ -248,7 +256,7 @@ class CanopyScan:
             np.count_nonzero(self._agreed[index][chosen, _ALONG_INSTANCES])
             for index, chosen in zip(order, of_masks, strict=True)
         ]
-        return lone_views(np.array(along) / np.maximum(points, 1), points)
+        return np.array(along) / np.maximum(points, 1), points
 
     def parts(self, observed: Observed, models: Models) -> tuple[Parts, Observed]:
         """Return what is to be joined, without specks, and the forest in the same numbers."""

@@ -71,8 +71,8 @@ class SkeletonDocument:
     position: (V, 3); radius, confidence: (V,); occluded: (V,) bool; edges: (E, 2), acyclic,
     partitioned by `branches`, parents before children. root: vertex the main tree grows from,
     None where there is no vertex. preview: joined by a spanning tree, ahead of the search.
-    views_alone: indices of views that agree with no other, wherever they are moved. extra: further
-    per-vertex arrays of the JSON by name, e.g. `segmented` in ground truth.
+    views_alone: indices of views that hardly agree with any other, also if moved by centimetres.
+    extra: further per-vertex arrays of the JSON by name, e.g. `segmented` in ground truth.
     """
 
     scan_id: str

@@ -142,8 +142,9 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
         min(_LEAST_DISPARITY, 0.5 / config.farthest_m),
     )
     measured_px = half_width_px(quality)
+    thickest_m = config.thickest_fragment_m if fragments else config.thickest_m
     probable_px = _probable_px(measured_px, regions.radius_px, fragments=fragments)
-    kept, pixel_m, points = _lifted(view, counts, knots, measured_px, config, fragments=fragments)
+    kept, pixel_m, points = _lifted(view, counts, knots, measured_px, thickest_m, config)
     return [
         Piece(
             spline=BranchSpline(
@@ -154,7 +155,7 @@ def pieces_of(view: View, regions: Regions, config: PieceConfig, *, fragments: b
                 control_points_in_base=line[: counts[i]],
             ),
             fragment=fragments,
-            radius_m=float(probable_px[i]) * pixel,
+            radius_m=min(float(probable_px[i]) * pixel, thickest_m),
             pixel_m=pixel,
             quality=quality[i],
             said=regions.said[i],
@@ -168,9 +169,8 @@ def _lifted(
     counts: IntArray,
     knots: FloatArray,
     radius_px: FloatArray,
+    thickest_m: float,
     config: PieceConfig,
-    *,
-    fragments: bool,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return which regions are no thicker than a branch, their pixels in m (R,), knots in base."""
     kept = np.flatnonzero(counts)
@@ -178,7 +178,6 @@ def _lifted(
     has = np.arange(knots.shape[1]) < counts[kept, None]
     mean_disparity = np.sum(disparity, axis=1, where=has) / counts[kept]
     pixel_m = 1.0 / view.intrinsics.fx_px / mean_disparity
-    thickest_m = config.thickest_fragment_m if fragments else config.thickest_m
     slender = radius_px[kept] * pixel_m <= thickest_m
     kept, pixel_m, has = kept[slender], pixel_m[slender], has[slender]
     depth_m = 1.0 / np.where(has, disparity[slender], 1.0)

@@ -350,7 +350,12 @@ class Skeletonizer:
         matched = any(known.matched for known in self._known.values())
         models = self._models["stereo" if matched else "camera"]
         scan, brought = self._canopy.brought_back(models)
-        likelihood = self._map if scan is self._canopy else self._map_of(scan.splines())
+        likelihood = self._map
+        if brought:
+            try:
+                likelihood = self._map_of(scan.splines())
+            except UsageError:  # No room for a second map: they stay where they are, and are named.
+                scan, brought = self._canopy, []
         joined = skeleton_of(scan, likelihood, models)
         return Extraction(
             graph=joined.graph,

@@ -11,7 +11,8 @@ from canopy_skel.geometry import FloatArray, IntArray, transform_from, transform
 from canopy_skel.kernels import aligning, fuse
 
 _MIN_COSINE = 0.9
-_FEWEST_VIEWS, _FEWEST_POINTS, _ALONE = 3, 100, 0.5
+_FEWEST_VIEWS, _FEWEST_POINTS, _ALONE, _LEAST_USUAL = 3, 100, 0.5, 0.3
+_FEWEST_TO_FIND, _FOUND, _FARTHEST_M, _MOST_TURNED = 250, 0.8, 0.15, np.radians(8.0)
 _SEARCH_M, _STEP_M, _SAMPLE, _TRIES = 0.08, 0.02, 300, 4
 
 
@@ -69,6 +70,8 @@ def lone_views(along: FloatArray, points: IntArray) -> list[LoneView]:
     if np.count_nonzero(enough) < _FEWEST_VIEWS:
         return []
     usual = float(np.median(along[enough]))
+    if usual < _LEAST_USUAL:  # None agrees with any other.
+        return []
     alone = np.flatnonzero(enough & (along < _ALONE * usual))
     return [LoneView(view=i, along=float(along[i]), usual=usual) for i in alone.tolist()]
 
@@ -96,15 +99,18 @@ def pose_corrections(
 
 
 def found_again(
-    points: FloatArray, directions: FloatArray, others: Observed, config: PoseConfig
-) -> tuple[FloatArray, float]:
-    """Return the rigid motion (4, 4) that takes a lone view's wood onto what other views show.
+    view: int, points: FloatArray, directions: FloatArray, others: Observed, config: PoseConfig
+) -> PoseCorrection | None:
+    """Return the rigid motion that takes a lone view's wood onto what other views show.
 
     points, directions: (N, 3), of its instances. others: fused without it. Shifts of up to 8 cm
     along each axis are tried, the least of those first that as many points agree with; from the
-    best of them the view is aligned as others are. Also returns the median distance across the
-    wood then, infinite if too little of it fits.
+    best of them the view is aligned as others are. None where that fails, or ends farther off than
+    a rig is ever knocked (15 cm, 8 degrees), or where there is so little wood that it fits in many
+    places.
     """
+    if len(points) < _FEWEST_TO_FIND or len(others.vertices_in_base) == 0:
+        return None
     fine, coarse = _lines(others, _STEP_M), _lines(others, config.reach_m)
     some = np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(np.int64)
     steps = np.arange(-_SEARCH_M, _SEARCH_M + _STEP_M / 2, _STEP_M)
@@ -117,7 +123,18 @@ def found_again(
         here, ways = transform_points(moved, points), directions @ moved[:3, :3].T
         closer, _, after_m = _aligned(here, ways, coarse, config)
         moved = closer @ moved
-    return moved, after_m
+    way_m = float(np.linalg.norm(transform_points(moved, points) - points, axis=1).mean())
+    turned = np.linalg.norm(Rotation.from_matrix(moved[:3, :3]).as_rotvec())
+    if not np.isfinite(after_m) or way_m > _FARTHEST_M or turned > _MOST_TURNED:
+        return None
+    return PoseCorrection(
+        view=view, moved=moved, before_m=way_m, after_m=after_m, brought_back=True
+    )
+
+
+def is_found(view: LoneView, along: float) -> bool:
+    """Say whether a lone view lies along the others as views do, now that it was moved."""
+    return along >= _FOUND * view.usual
 
 
 def one_after_other(

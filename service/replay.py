@@ -74,7 +74,7 @@ class ReplayResult:
 
     @property
     def complete(self) -> bool:
-        """Whether no view was lost."""
+        """Whether no view was lost, moved by centimetres, or agrees with no other."""
         return not (self.warnings or self.document.views_rejected)
 
 
@@ -101,7 +101,9 @@ def replay(
     with stopwatch("export"):
         contents = _files(path.stem, document, walk, request)
     summary = _summary(recording, document, walk, extraction, stopwatch)
-    contents[_summary_name(path.stem)] = json.dumps(summary, indent=2).encode() + b"\n"
+    contents[_summary_name(path.stem)] = (
+        json.dumps(summary, indent=2, allow_nan=False).encode() + b"\n"
+    )
     warnings = [*recording.warnings, *_doubts(path, walk.skeletonizer, extraction)]
     if not document.branches:
         reasons = Counter(instance.reason for instance in walk.skeletonizer.rejected)
@@ -216,8 +218,9 @@ def _doubts(path: Path, skeletonizer: Skeletonizer, extraction: Extraction) -> l
     ]
     return moved + [
         f"{path.name}: view {skeletonizer.views[one.view]}: only {one.along:.0%} of its wood lies"
-        f" along that of other views (usually {one.usual:.0%}), wherever it is moved: its pose is"
-        " wrong, or it shows another tree; what it shows is in the skeleton, so record it anew"
+        f" along that of other views (usually {one.usual:.0%}), and moved by centimetres it does"
+        " not fit either: its pose is wrong, it shows another tree, or it looks where no other"
+        " does; what it shows is in the skeleton, so look at it or record it anew"
         for one in extraction.lone_views
     ]
 
@@ -266,7 +269,7 @@ def _summary(
         },
         "poses": [
             {
-                "before_mm": round(1000 * one.before_m, 2),
+                "moved_mm" if one.brought_back else "before_mm": round(1000 * one.before_m, 2),
                 "after_mm": round(1000 * one.after_m, 2),
                 "view": skeletonizer.views[one.view],
             }

@@ -1,5 +1,6 @@
 """Views whose poses are centimetres off: brought back if they fit anywhere, and always named."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,6 +97,41 @@ def test_half_of_the_views_may_be_off(views):
     assert {one.index for one in document.views_moved} == {v.index for v in views if v.index % 2}
 
 
+def test_a_view_with_little_wood_is_not_moved_for_it_fits_in_many_places(views):
+    def sparse(view):
+        largest = np.argsort(np.bincount(view.instances.ravel())[1:])[-2:] + 1
+        instances = np.where(np.isin(view.instances, largest), view.instances, 0)
+        return shifted(replace(view, instances=instances.astype(np.uint16)), [0, 0.05, 0])
+
+    document = skeleton_of(with_one(views, sparse))
+    assert document.views_moved == ()
+    assert document.views_alone == (OFF,)
+
+
+@pytest.mark.parametrize("apart_m", [0.3, 0.5])
+def test_views_that_have_nothing_in_common_are_not_moved(views, apart_m):
+    ways = apart_m * np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]])
+    document = skeleton_of([shifted(v, way) for v, way in zip(views, ways, strict=True)])
+    assert document.views_moved == ()
+
+
+def test_half_of_a_view_beside_what_the_others_show_stays_where_it_is(views):
+    middle = views[0].instances.shape[1] // 2
+
+    def left(view):
+        instances = view.instances.copy()
+        instances[:, middle + 60 :] = 0
+        return replace(view, instances=instances)
+
+    def right(view):
+        instances = view.instances.copy()
+        instances[:, : middle - 60] = 0
+        return replace(view, instances=instances)
+
+    some = [left(view) if view.index == OFF else right(view) for view in views]
+    assert skeleton_of(some).views_moved == ()
+
+
 def test_where_views_are_off_their_order_still_does_not_matter(views):
     some = with_one(views, lambda view: shifted(view, [0, 0.04, 0]))
     assert to_json(skeleton_of(some)) == to_json(skeleton_of(some[::-1]))
@@ -118,6 +154,10 @@ def test_a_replay_names_a_view_it_moved(views, tmp_path):
     ).warnings
     assert "view 3" in warning
     assert "4 cm off" in warning
+    [pose] = json.loads((tmp_path / "moved.summary.json").read_text())["poses"]
+    assert pose["view"] == OFF
+    assert pose["moved_mm"] == pytest.approx(40, abs=2)
+    assert pose["after_mm"] < 4
 
 
 def test_a_replay_names_a_view_that_fits_nowhere(views, tmp_path):
