@@ -87,6 +87,7 @@ function choose(scan) {
   $("picture").hidden = true;
   $("events").replaceChildren();
   view.show(null);
+  $("doubts").replaceChildren();
   const base = `/v1/scans/${chosen}`;
   $("recording").href = `${base}/recording.mcap`;
   $("formats").replaceChildren(...FORMATS.flatMap((format) =>
@@ -137,7 +138,17 @@ function showSkeleton(skeleton) {
   const length = skeleton.branches.reduce((sum, branch) => sum + branch.length, 0);
   $("legend").textContent = `Skeleton of ${skeleton.views.used} views: ${length.toFixed(1)} m in`
     + ` ${skeleton.branches.length} branches; blue seen, orange predicted; drag to turn`;
+  $("doubts").replaceChildren(...doubtsOf(skeleton.views).map((text) => element("li", text)));
   view.show(skeleton);
+}
+
+function doubtsOf({ moved = [], alone = [] }) {
+  return [
+    ...moved.map(({ index, by_m }) => `View ${index}: its pose was ${Math.round(100 * by_m)} cm off,`
+      + " or the tree moved; it was taken to where the other views show its wood."),
+    ...alone.map((index) => `View ${index} hardly agrees with any other: a wrong pose, another`
+      + " tree, or it looks where no other does."),
+  ];
 }
 
 function showEvent(kind, data) {

@@ -5,7 +5,7 @@ import socket
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ import httpx2
 import numpy as np
 from fake_rig import FakeRig
 
-from canopy_skel.document import Method, build_document, to_json
+from canopy_skel.document import Method, MovedView, build_document, to_json
 from canopy_skel.graph import SkeletonGraph
 from service.app import create_app
 from service.catalogue import Catalogue
@@ -82,7 +82,14 @@ def wait_until(condition, timeout_s: float = 5.0):
     return value
 
 
-def skeleton(scan_id: str, revision: int, length_m: float = 1.0) -> bytes:
+def skeleton(
+    scan_id: str,
+    revision: int,
+    length_m: float = 1.0,
+    *,
+    moved: Sequence[MovedView] = (),
+    alone: Sequence[int] = (),
+) -> bytes:
     """Return the document of a bare pole."""
     graph = SkeletonGraph(
         vertices_in_base=np.array([[0.0, 0, 0], [0, 0, length_m / 2], [0, 0, length_m]]),
@@ -98,6 +105,8 @@ def skeleton(scan_id: str, revision: int, length_m: float = 1.0) -> bytes:
             revision=revision,
             method=Method(name="paper", voxel_size_m=0.005),
             views_used=revision,
+            views_moved=moved,
+            views_alone=alone,
         )
     )
 

@@ -7,6 +7,7 @@ from fake_rig import DEMO_RECORDING
 from live_service import serving, skeleton, wait_until
 from playwright.sync_api import expect, sync_playwright
 
+from canopy_skel.document import MovedView
 from service.http.access import Access
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -55,6 +56,24 @@ def test_an_operator_starts_a_scan_watches_the_skeleton_grow_and_stops_the_arm(p
         expect(page.locator("#legend")).to_contain_text("Skeleton of 2 views: 2.0 m")
         page.get_by_role("button", name="STOP").click()
         wait_until(lambda: live.rig.stops == 1)
+
+
+def test_views_that_were_not_where_they_said_are_named_under_the_skeleton(page, tmp_path):
+    with serving(tmp_path) as live:
+        page.goto(live.url)
+        expect(page.get_by_role("status")).to_have_text("ready")
+        page.get_by_label("Tree").fill("row3-tree12")
+        page.get_by_role("button", name="Start").click()
+        expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
+        scan_id = live.rig.specs[0].scan_id
+        moved = [MovedView(index=1, by_m=0.047)]
+        live.rig.publish(scan_id, skeleton(scan_id, 1, moved=moved, alone=[2]))
+        doubts = page.get_by_role("list", name="doubts").get_by_role("listitem")
+        expect(doubts).to_have_count(2)
+        expect(doubts.nth(0)).to_contain_text("View 1: its pose was 5 cm off")
+        expect(doubts.nth(1)).to_contain_text("View 2 hardly agrees with any other")
+        live.rig.publish(scan_id, skeleton(scan_id, 2))
+        expect(doubts).to_have_count(0)
 
 
 def test_a_recording_is_replayed_which_cannot_be_paused(page, tmp_path):
