@@ -12,8 +12,14 @@ from canopy_skel.kernels import aligning, fuse
 
 _MIN_COSINE = 0.9
 _FEWEST_VIEWS, _FEWEST_POINTS, _ALONE, _LEAST_USUAL = 3, 100, 0.5, 0.3
+"""Of so many views with so many points, one is alone that has less than half of the usual share of
+its wood along others; where less than .3 is usual, that says nothing."""
 _FEWEST_TO_FIND, _FOUND, _FARTHEST_M, _MOST_TURNED = 250, 0.8, 0.15, np.radians(8.0)
-_SEARCH_M, _STEP_M, _SAMPLE, _TRIES = 0.08, 0.02, 300, 4
+"""It is found again if it has so many points, then four fifths of the usual share, and no more than
+this to go."""
+_SEARCH_M, _STEP_M, _SAMPLE, _ALIGNINGS = 0.08, 0.02, 300, 4
+"""How far and how finely shifts are tried, on so many points; and how often it is aligned then, as
+each time reaches only so far."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -119,7 +125,7 @@ def found_again(
     fits = [len(_near(points[some] + shift, directions[some], fine)[0]) for shift in shifts]
     moved, after_m = np.eye(4), np.inf
     moved[:3, 3] = shifts[int(np.argmax(fits))]
-    for _ in range(_TRIES):
+    for _ in range(_ALIGNINGS):
         here, ways = transform_points(moved, points), directions @ moved[:3, :3].T
         closer, _, after_m = _aligned(here, ways, coarse, config)
         moved = closer @ moved

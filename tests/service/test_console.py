@@ -38,14 +38,19 @@ def page(browser):
     assert problems == []
 
 
+def started(page, live):
+    """Start a scan as an operator does; return its id."""
+    page.goto(live.url)
+    expect(page.get_by_role("status")).to_have_text("ready")
+    page.get_by_label("Tree").fill("row3-tree12")
+    page.get_by_role("button", name="Start").click()
+    expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
+    return live.rig.specs[0].scan_id
+
+
 def test_an_operator_starts_a_scan_watches_the_skeleton_grow_and_stops_the_arm(page, tmp_path):
     with serving(tmp_path) as live:
-        page.goto(live.url)
-        expect(page.get_by_role("status")).to_have_text("ready")
-        page.get_by_label("Tree").fill("row3-tree12")
-        page.get_by_role("button", name="Start").click()
-        expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
-        scan_id = live.rig.specs[0].scan_id
+        scan_id = started(page, live)
         live.rig.photograph(scan_id, 1)  # the recording behind it begins with view 1
         expect(page.get_by_alt_text("newest view")).to_be_visible()
         assert page.locator("#tree").evaluate(INK) == 0
@@ -60,12 +65,7 @@ def test_an_operator_starts_a_scan_watches_the_skeleton_grow_and_stops_the_arm(p
 
 def test_views_that_were_not_where_they_said_are_named_under_the_skeleton(page, tmp_path):
     with serving(tmp_path) as live:
-        page.goto(live.url)
-        expect(page.get_by_role("status")).to_have_text("ready")
-        page.get_by_label("Tree").fill("row3-tree12")
-        page.get_by_role("button", name="Start").click()
-        expect(page.locator("#detail")).to_contain_text("running, 0 of 3 views")
-        scan_id = live.rig.specs[0].scan_id
+        scan_id = started(page, live)
         moved = [MovedView(index=1, by_m=0.047)]
         live.rig.publish(scan_id, skeleton(scan_id, 1, moved=moved, alone=[2]))
         doubts = page.get_by_role("list", name="doubts").get_by_role("listitem")
